@@ -2,6 +2,9 @@
 
 One line per number of points, with and without distances by the images' sizes. A pose is right if
 its squared error over its covariance is one that chance allows. The last line is of EO devices.
+
+With `--readout`, a rolling shutter reads the frames while the camera shifts and turns, each so much
+as `motion_sd_deg_s` says that the scene turns; the pose is that of the middle row.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,7 +25,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import rotation_about
 from kgcp.network.ground.device import orient_by_device
-from kgcp.network.ground.point_images import CameraPose, PointImages
+from kgcp.network.ground.point_images import CameraPose, PointImages, Readout
 from kgcp.network.ground.resection import NoPoseError, orient
 from kgcp.pipeline.execution.threads import use_one_thread_each
 
@@ -50,6 +53,12 @@ class Setup:
     has_distance: bool
     frames: int
     seed: int
+    readout_s: float = 0.0
+
+    @property
+    def camera(self) -> Camera:
+        """The camera, with its shutter."""
+        return replace(_CAMERA, readout_s=self.readout_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +100,7 @@ def _scene(setup: Setup, rng: np.random.Generator) -> tuple[CameraPose, PointIma
         )
     )
     true = places + rng.normal(0.0, _SD_POSITION_M, places.shape)
-    in_camera = pose.in_camera(true)
+    in_camera = _seen(setup.camera, pose, true, rng)
     pixels = _CAMERA.project(in_camera) + rng.normal(0.0, _SD_PX, (count, 2))
     distance = np.linalg.norm(in_camera, axis=1) * (1.0 + rng.normal(0.0, _SD_DISTANCE, count))
     names = np.arange(count)
@@ -108,8 +117,29 @@ def _scene(setup: Setup, rng: np.random.Generator) -> tuple[CameraPose, PointIma
         np.repeat(_SD_PX**2 * np.eye(2)[None], count, axis=0),
         distance if setup.has_distance else unknown,
         _SD_DISTANCE * distance if setup.has_distance else unknown,
+        readout=Readout.of(setup.camera, pixels),
     )
     return pose, images
+
+
+def _seen(
+    camera: Camera, pose: CameraPose, points_m: FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """Return points (n, 3) in the camera frame, each at the moment of its row."""
+    seen = pose.in_camera(points_m)
+    if not camera.readout_s:
+        return seen
+    sd_rad_s = math.radians(camera.motion_sd_deg_s)
+    motion = rng.normal(0.0, np.repeat([sd_rad_s * _HEIGHT_M, sd_rad_s], 3))
+    for _ in range(3):  # the row depends on the motion
+        delay_s = camera.readout_s * (camera.project(seen)[:, 1] / (camera.height - 1) - 0.5)
+        seen = np.vstack(
+            [
+                pose.moved(each_s * motion).in_camera(point[None])
+                for each_s, point in zip(delay_s.tolist(), points_m, strict=True)
+            ]
+        )
+    return seen
 
 
 def measure(setup: Setup) -> Outcome:
@@ -120,7 +150,7 @@ def measure(setup: Setup) -> Outcome:
     for _ in range(setup.frames):
         truth, images = _scene(setup, rng)
         try:
-            found = orient(_CAMERA, images)
+            found = orient(setup.camera, images)
         except NoPoseError as refusal:
             refused[_NUMBERS.sub("#", str(refusal))] += 1
             continue
@@ -210,10 +240,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--frames", type=int, default=300, help="per line")
     parser.add_argument("--points", type=int, nargs="*", default=_POINTS)
+    parser.add_argument("--readout", type=float, default=0.0, help="of a rolling shutter [s]")
     parser.add_argument("--devices", type=int, default=400, help="frames with an EO device")
     options = parser.parse_args(arguments)
     setups = [
-        Setup(points, has_distance, options.frames, 0)
+        Setup(points, has_distance, options.frames, 0, options.readout)
         for has_distance, points in itertools.product((True, False), options.points)
     ]
     outcomes = []

@@ -189,6 +189,10 @@ class Camera:
         """Geometric mean of the two principal distances [px]."""
         return math.sqrt(self.fx * self.fy)
 
+    def delay_s(self, pixels: FloatArray) -> FloatArray:
+        """Return how much later than the middle row pixels (n, 2) are exposed (n,) [s]."""
+        return self.readout_s * (pixels[:, 1] / (self.height - 1) - 0.5)
+
     def project(self, points_camera: FloatArray) -> FloatArray:
         """Project points (n, 3) in the camera frame [m] to raw pixels (n, 2)."""
         return self.distort(points_camera[..., :2] / points_camera[..., 2:3])

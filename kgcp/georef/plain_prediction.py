@@ -114,10 +114,13 @@ def _predicted(
     cov_m2 = camera_from_enu @ cov_m2 @ camera_from_enu.T
     distance_m = float(np.linalg.norm(sight_m))
     along, by_place = sight_m / distance_m, _pixel_slopes(camera, sight_m)
+    # a rolling shutter's camera moves until the row is exposed
+    delay_s = float(camera.delay_s(centre_px[None])[0])
+    turn_px = math.radians(camera.motion_sd_deg_s) * delay_s * camera.mean_focal_px
     sd_along = math.sqrt(max(0.0, float(along @ cov_m2 @ along))) / distance_m
     return PlainPrediction(
         centre_px=centre_px,
-        cov_px2=by_place @ cov_m2 @ by_place.T + floor_px**2 * np.eye(2),
+        cov_px2=by_place @ cov_m2 @ by_place.T + (floor_px**2 + turn_px**2) * np.eye(2),
         position_m=sight_m,
         sd_log_distance=math.hypot(sd_along, floor_log),
         normal=_stated_normal(target, place.position_m, orientation, positions.local_frame),

@@ -52,7 +52,7 @@ class Sighting:
         """
         if self.time_s is None:
             return None
-        return self.time_s + self.rows_since_middle(camera) * camera.readout_s
+        return self.time_s + float(camera.delay_s(self.centre_px[None])[0])
 
     def rows_since_middle(self, camera: Camera) -> float:
         """Return how far below the middle row the centre lies, in frames: -0.5 … 0.5 inside."""

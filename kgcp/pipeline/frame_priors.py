@@ -89,13 +89,11 @@ def _with_rates(
 ) -> dict[int, SceneRotation]:
     """Combine the camera's rates of the times file with those from the frames around."""
     rotations = dict(by_frames_around)
-    if flight.camera.readout_s:
-        unknown = SceneRotation.unknown(flight.camera)
-        for row, frame in enumerate(frames):
-            rate = data.frame_times.rotation.get(frame)
-            if rate is not None:
-                velocity = np.array(rate.velocity_rad_s)
-                rotations[row] = combine(velocity, rate.sd_rad_s, rotations.get(row, unknown))
+    unknown, rates = SceneRotation.unknown(flight.camera), data.scene_rotations
+    for row, frame in enumerate(frames):
+        if frame in rates:
+            velocity = np.array(rates[frame].velocity_rad_s)
+            rotations[row] = combine(velocity, rates[frame].sd_rad_s, rotations.get(row, unknown))
     return rotations
 
 

@@ -21,7 +21,6 @@ from kgcp.georef.plain_prediction import (
 )
 from kgcp.georef.prediction import Track, predict_position, reference_states, state_of
 from kgcp.georef.sighting import Sighting, sighting_of
-from kgcp.georef.target_positions import TargetPositions
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.marks import HandMark
@@ -166,7 +165,7 @@ def plain_by_results(
     if not lacking:
         return {}
     by_neighbours = tracks.predictions(flight.camera, lacking)
-    by_targets = _by_own_targets(flight, data.static_positions, [*rows], sightings)
+    by_targets = _by_own_targets(flight, data, [*rows], sightings)
     made: dict[int, Predictions] = {}
     for frame, row in rows.items():
         places = {mark.target: mark.place for mark in marks.get(frame, ())}
@@ -188,13 +187,18 @@ def plain_by_results(
 
 
 def _by_own_targets(
-    flight: Flight, positions: TargetPositions, frames: Sequence[str], sightings: Sequence[Sighting]
+    flight: Flight, data: FlightData, frames: Sequence[str], sightings: Sequence[Sighting]
 ) -> dict[str, Predictions]:
     """Return by frame where plain targets must be, as other static targets orient it."""
     made: dict[str, Predictions] = {}
-    scale_sd = print_scale_sd(flight.all_targets)
+    positions = data.static_positions
     for oriented in orient_frames(
-        frames, sightings, positions.static, flight.camera, sd_scale=scale_sd
+        frames,
+        sightings,
+        positions.static,
+        flight.camera,
+        sd_scale=print_scale_sd(flight.all_targets),
+        rotations=data.scene_rotations,
     ):
         if oriented.pose is not None:
             orientation = FrameOrientation(

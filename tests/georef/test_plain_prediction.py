@@ -65,6 +65,21 @@ def test_poses_without_both_deviations_are_trusted_less(
     assert all(4.0 < one.sd_px < 6.0 for one in named.values())
 
 
+def test_a_rolling_shutter_widens_predictions_away_from_the_middle_row(made: Path) -> None:
+    flight = read_flight(made)
+    positions = FlightData(flight, ["f_0.png"]).static_positions
+    poses = FlightData(flight, ["f_0.png"]).reference_poses
+    orientation = reference_orientations(poses, positions.local_frame)["f_0.png"]
+    still = predict_plain(flight.plain_targets, orientation, positions, CAMERA)
+    rolling = replace(CAMERA, readout_s=0.1)
+    moving = predict_plain(flight.plain_targets, orientation, positions, rolling)
+    for name, one in still.items():
+        # 5°/s until the row is exposed
+        share = one.centre_px[1] / (CAMERA.height - 1) - 0.5
+        turn_px = CAMERA.fx * np.radians(5.0) * 0.1 * share
+        assert moving[name].sd_px == pytest.approx(np.hypot(one.sd_px, turn_px), rel=1e-3)
+
+
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.6, 0.0, 0.8)])
 def test_a_face_lies_above_its_position(normal: tuple[float, float, float]) -> None:
     frame = LocalFrame.at(CRS, ORIGIN_MAP)

@@ -155,3 +155,54 @@ def test_a_ring_alone_is_as_sure_as_the_less_sure_of_both_says(
     sight /= np.linalg.norm(sight)
     off_m = -sight @ (found.pose.centre_m - flight.centres[4])
     assert off_m / np.sqrt(sight @ found.cov[:3, :3] @ sight) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("frames", [5, 12])
+def test_a_ring_alone_shares_the_errors_of_positions_with_all_frames(frames: int) -> None:
+    """More frames do not tell better how its plate lies, if the other targets are misplaced."""
+    rng, z = np.random.default_rng(9), []
+    for seed in range(30):
+        flight = GroundFlight(frames=frames, seed=seed)
+        sightings = [
+            measured_ring(flight, row, column, rng)
+            for row in range(frames)
+            for column in range(1 if row == frames - 1 else 4)
+        ]
+        stated_m = flight.positions + SD_POSITION_M * rng.standard_normal((4, 3))
+        cov_m2 = SD_POSITION_M**2 * np.eye(3)
+        places = {
+            name: TargetPosition(place, cov_m2)
+            for name, place in zip(flight.names, stated_m, strict=True)
+        }
+        found = orient_frames(flight.frame_names, sightings, places, CAMERA, sd_scale=0.0)[-1]
+        assert found.pose is not None
+        assert found.cov is not None
+        assert found.is_by_one_ring
+        turn = found.pose.world_from_camera @ flight.rotations[-1].T
+        odd = 0.5 * (turn - turn.T)
+        error = [*(found.pose.centre_m - flight.centres[-1]), odd[2, 1], odd[0, 2], odd[1, 0]]
+        z.append(np.array(error) / np.sqrt(np.diag(found.cov)))
+    assert 0.7 < float(np.sqrt(np.mean(np.square(z)))) < 1.25
+
+
+def measured_ring(
+    flight: GroundFlight, row: int, column: int, rng: np.random.Generator
+) -> Sighting:
+    """A ring's pose with noise of its covariance."""
+    true = flight.pose(row, column)
+    sds = np.array([*[2e-4] * 2, SD_DISTANCE * true.distance_m, *[2e-5] * 3])
+    pose = true.moved(sds * rng.standard_normal(6))
+    return Sighting(
+        frame=flight.frame_names[row],
+        number=row + 1,
+        target=flight.names[column],
+        instance=0,
+        time_s=None,
+        centre_px=CAMERA.project(pose.translation_m[None])[0],
+        centre_cov_px2=(CAMERA.fx * 2e-4 / true.distance_m) ** 2 * np.eye(2),
+        distance_m=pose.distance_m,
+        sd_distance_m=SD_DISTANCE * true.distance_m,
+        sd_common_distance_m=None,
+        pose=pose,
+        pose_cov=np.diag(sds**2),
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 from kgcp.errors import KgcpError
@@ -13,6 +13,7 @@ from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.frame_times import FrameTimes, read_times
 from kgcp.io.formats.orientations import read_reference_poses
 from kgcp.io.formats.trajectories import read_trajectory
+from kgcp.measurement.plate_prior import SceneRotation
 from kgcp.settings import VehicleSettings
 from kgcp.targets.plain import AnyTarget
 
@@ -63,6 +64,17 @@ class FlightData:
         if flight.times_file is None:
             return FrameTimes({})
         return read_times(flight.times_file, self._frames, flight.times_format)
+
+    @property
+    def scene_rotations(self) -> Mapping[str, SceneRotation]:
+        """How the scene turns while a rolling shutter reads frames, by those with rates.
+
+        Raises
+        ------
+        KgcpError
+            As `frame_times`.
+        """
+        return self.frame_times.rotation if self._flight.camera.readout_s else {}
 
     @cached_property
     def reference_poses(self) -> ReferencePoses:

@@ -19,7 +19,7 @@ from kgcp.errors import SettingError
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.attitude import rotation_onto
 from kgcp.geometry.camera import Camera
-from kgcp.network.ground.point_images import CameraPose, PointImages
+from kgcp.network.ground.point_images import CameraPose, PointImages, Readout
 from kgcp.network.ground.pose_adjustment import adjusted_pose
 from kgcp.network.ground.pose_hypotheses import three_point_poses
 from kgcp.network.ground.resection import NoPoseError
@@ -130,7 +130,7 @@ def orient_by_device(
     starts = _starts(camera, points_m, pixels, sd_focal)
     fits = []
     for names, start in starts[:_REFINED]:
-        images = _named(points_m[list(names)], pixels, pixel_cov)
+        images = _named(camera, points_m[list(names)], pixels, pixel_cov)
         adjusted = adjusted_pose(camera, images, start, sd_focal)
         if adjusted is not None:
             pose, cov, residuals = adjusted
@@ -148,10 +148,13 @@ def orient_by_device(
     return DevicePose(pose, cov, np.array(names), rms, margin)
 
 
-def _named(positions_m: FloatArray, pixels: FloatArray, pixel_cov: FloatArray) -> PointImages:
+def _named(
+    camera: Camera, positions_m: FloatArray, pixels: FloatArray, pixel_cov: FloatArray
+) -> PointImages:
     unknown = np.full(len(pixels), np.nan)
     exact = np.zeros((len(pixels), 3, 3))
-    return PointImages(positions_m, exact, pixels, pixel_cov, unknown, unknown)
+    readout = Readout.of(camera, pixels)
+    return PointImages(positions_m, exact, pixels, pixel_cov, unknown, unknown, readout=readout)
 
 
 def _starts(

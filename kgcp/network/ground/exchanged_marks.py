@@ -12,7 +12,7 @@ import numpy as np
 from kgcp.geometry.camera import Camera
 from kgcp.georef.plain_prediction import MarkedPlace
 from kgcp.georef.target_positions import TargetPosition
-from kgcp.network.ground.point_images import CameraPose, PointImages
+from kgcp.network.ground.point_images import CameraPose, PointImages, Readout
 from kgcp.network.ground.pose_adjustment import adjusted_pose
 from kgcp.network.ground.pose_hypotheses import three_point_poses
 
@@ -40,31 +40,37 @@ def exchanged_marks(
     names = [*places]
     if len(names) < 3:
         return None
-    images = _point_images(places, positions)
+    images = _point_images(places, positions, camera)
     if any(next(_misfits(camera, each), None) is not None for each in _displaced(images)):
         return None
     misfits = {}
     for pair in combinations(range(len(names)), 2):
         order = np.arange(len(names))
         order[list(pair)] = pair[::-1]
-        exchanged = replace(images, pixels=images.pixels[order], pixel_cov=images.pixel_cov[order])
+        pixels = images.pixels[order]
+        readout = Readout.of(camera, pixels)
+        exchanged = replace(
+            images, pixels=pixels, pixel_cov=images.pixel_cov[order], readout=readout
+        )
         misfits[pair] = min(_misfits(camera, exchanged), default=math.inf)
     first, second = min(misfits, key=lambda pair: misfits[pair])
     return (names[first], names[second]) if math.isfinite(misfits[first, second]) else None
 
 
 def _point_images(
-    places: Mapping[str, MarkedPlace], positions: Mapping[str, TargetPosition]
+    places: Mapping[str, MarkedPlace], positions: Mapping[str, TargetPosition], camera: Camera
 ) -> PointImages:
     covs = [positions[name].cov_m2 for name in places]
+    pixels = np.array([(place.x_px, place.y_px) for place in places.values()])
     unknown = np.full(len(places), np.nan)
     return PointImages(
         np.array([positions[name].position_m for name in places]),
         np.array([np.zeros((3, 3)) if cov is None else cov for cov in covs]),
-        np.array([(place.x_px, place.y_px) for place in places.values()]),
+        pixels,
         np.array([place.sd_px**2 * np.eye(2) for place in places.values()]),
         unknown,
         unknown,
+        readout=Readout.of(camera, pixels),
     )
 
 

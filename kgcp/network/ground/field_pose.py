@@ -11,7 +11,7 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle_image import Circles3D, eccentricity, plane_axes
 from kgcp.network.ground.frame_poses import FOCAL_DETERMINED, FOCAL_SCALES, SD_FOCAL
-from kgcp.network.ground.point_images import CameraPose, PointImages
+from kgcp.network.ground.point_images import CameraPose, PointImages, Readout
 from kgcp.network.ground.resection import NoPoseError, Resection, orient
 from kgcp.targets.fields.points import AnyField
 
@@ -82,7 +82,10 @@ def orient_by_field(
     positions_m, axes = field.points_m()[point], plane_axes(field.normals()[point])
     radii_m, unknown = field.radii_m()[point], np.full(len(point), np.nan)
     position_cov = field.point_sds_m()[point, :, None] ** 2 * np.eye(3)
-    images = PointImages(positions_m, position_cov, places, place_cov, unknown, unknown)
+    readout = Readout.of(camera, places)
+    images = PointImages(
+        positions_m, position_cov, places, place_cov, unknown, unknown, readout=readout
+    )
     found = _first(camera, images, has_free_focal=has_free_focal)
     beyond_px = math.nan
     for _ in range(_ROUNDS):

@@ -11,6 +11,7 @@ import contextlib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,9 +19,12 @@ from scipy.spatial.transform import Rotation
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import rotation_about
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition
-from kgcp.network.ground.point_images import CameraPose, PointImages
+from kgcp.measurement.plate_prior import SceneRotation
+from kgcp.network.ground.point_images import CameraPose, PointImages, Readout
+from kgcp.network.ground.pose_adjustment import position_slopes
 from kgcp.network.ground.resection import MIN_MARGIN, MIN_POINTS, NoPoseError, Resection, orient
 from kgcp.targets.plain import AnyTarget
 
@@ -32,11 +36,15 @@ SD_FOCAL = 0.7
 FOCAL_DETERMINED = 0.05
 """Relative standard deviation of a focal length that is determined, at most."""
 
+NO_ROTATIONS: Mapping[str, SceneRotation] = MappingProxyType({})
+"""For frames of which nothing is known of the motion during the readout."""
+
 UNSTATED_SCALE_SD = 0.005
 """Of the logarithm of all distances together, where nobody says how well targets are printed."""
 
 _MOST_SCALE_SD = 4.0  # standard deviations that all distances may be off by, alike
 _LEAST_PLATE_FRAMES = 3  # that tell how a plate lies
+_LEAST_TURN_RAD = 1e-5  # of the deviation of how it lies by one of them
 _AGREEING_CHI2 = 25.0  # of three coordinates, at most
 
 
@@ -53,6 +61,8 @@ class FramePose:
         In the local ENU frame; None: not oriented.
     cov : (6, 6) array or None
         Position [m] and left rotation vector [rad], ENU axes.
+    by_positions : (6, m, 3) array or None
+        How the pose follows the positions of the m used targets; None: not by three targets.
     used : tuple of str
         Targets that agree with it.
     reason : str
@@ -90,6 +100,7 @@ class FramePose:
     chi2: FloatArray | None = None
     distance_scale: float | None = None
     sd_distance_scale: float | None = None
+    by_positions: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,8 +130,9 @@ def orient_frames(
     min_points: int = MIN_POINTS,
     has_free_focal: bool = False,
     sd_scale: float = UNSTATED_SCALE_SD,
+    rotations: Mapping[str, SceneRotation] = NO_ROTATIONS,
 ) -> list[FramePose]:
-    """Orient frames by their static targets.
+    """Orient frames by their static targets, at the moment of the middle row.
 
     Parameters
     ----------
@@ -138,22 +150,37 @@ def orient_frames(
         Of the logarithm of what all distances may be off by, alike, by their prints: see
         `print_scale_sd`. The common share that the sightings state has what was stated of their
         prints in it, and the calibration: the larger one of the two counts.
+    rotations : mapping of str to SceneRotation
+        How the scene turns while frames are read, as far as it is known, by their names.
     """
     by_frame: dict[str, list[Sighting]] = {frame: [] for frame in frames}
     for each in sightings:
         if each.frame in by_frame and each.target in positions and not each.instance:
             by_frame[each.frame].append(each)
-    poses = [
-        _by_points(
-            frame, mine, positions, camera, min_points, sd_scale, has_free_focal=has_free_focal
+    poses = []
+    for frame, mine in by_frame.items():
+        usable = [each for each in mine if each.centre_cov_px2 is not None]
+        names = tuple(each.target for each in usable)
+        if len(usable) < 3:
+            poses.append(FramePose(frame, names, None, None, (), _count_words(len(usable))))
+            continue
+        images = point_images(usable, positions, sd_scale, camera, rotations.get(frame))
+        poses.append(
+            _by_points(frame, names, images, camera, min_points, has_free_focal=has_free_focal)
         )
-        for frame, mine in by_frame.items()
-    ]
     if has_free_focal:
         return poses
-    plates = _plate_attitudes(poses, by_frame)
+    plates = _plate_attitudes(poses, by_frame, positions, camera, rotations)
     return [
-        _by_ring(pose, by_frame[pose.frame], positions, plates, sd_scale)
+        _by_ring(
+            pose,
+            by_frame[pose.frame],
+            positions,
+            plates,
+            sd_scale,
+            camera,
+            rotations.get(pose.frame),
+        )
         if pose.pose is None and pose.targets
         else pose
         for pose in poses
@@ -161,9 +188,21 @@ def orient_frames(
 
 
 def point_images(
-    sightings: Sequence[Sighting], positions: Mapping[str, TargetPosition], sd_scale: float
+    sightings: Sequence[Sighting],
+    positions: Mapping[str, TargetPosition],
+    sd_scale: float,
+    camera: Camera,
+    rotation: SceneRotation | None,
 ) -> PointImages:
-    """Return measured targets as points of known position; `sd_scale` as for `orient_frames`."""
+    """Return a frame's measured targets as points of known position.
+
+    Parameters
+    ----------
+    sd_scale : float
+        As for `orient_frames`.
+    rotation : SceneRotation or None
+        As for `Readout.of`.
+    """
     no_cov = np.zeros((3, 3))
     places = [positions[each.target] for each in sightings]
     # a print may be wrong by itself, or as those of all targets are: both are allowed for
@@ -174,14 +213,16 @@ def point_images(
         for each in sightings
     ]
     known = np.isfinite(sds)
+    pixels = np.array([each.centre_px for each in sightings])
     return PointImages(
         np.array([place.position_m for place in places]),
         np.array([no_cov if place.cov_m2 is None else place.cov_m2 for place in places]),
-        np.array([each.centre_px for each in sightings]),
+        pixels,
         np.array([each.centre_cov_px2 for each in sightings]),
         np.where(known, [each.distance_m for each in sightings], np.nan),
         np.array(sds),
         max(sd_scale, float(np.median([_common_share(each) for each in sightings]))),
+        Readout.of(camera, pixels, rotation),
     )
 
 
@@ -192,20 +233,14 @@ def _common_share(sighting: Sighting) -> float:
 
 def _by_points(
     frame: str,
-    sightings: Sequence[Sighting],
-    positions: Mapping[str, TargetPosition],
+    names: tuple[str, ...],
+    images: PointImages,
     camera: Camera,
     min_points: int,
-    sd_scale: float,
     *,
     has_free_focal: bool,
 ) -> FramePose:
     """Orient a frame by three targets or more; where that fails, give the reason."""
-    usable = [each for each in sightings if each.centre_cov_px2 is not None]
-    names = tuple(each.target for each in usable)
-    if len(usable) < 3:
-        return FramePose(frame, names, None, None, (), _count_words(len(usable)))
-    images = point_images(usable, positions, sd_scale)
     focals, sd_focal_before = (FOCAL_SCALES, SD_FOCAL) if has_free_focal else ((1.0,), 0.0)
 
     def resected(points: PointImages) -> Resection:
@@ -224,7 +259,7 @@ def _by_points(
     if sd_focal is not None and sd_focal > FOCAL_DETERMINED:
         reason = f"the focal length is not determined (± {100.0 * sd_focal:.0f} %)"
         return FramePose(frame, names, None, None, (), reason)
-    return _of_resection(frame, names, found, sd_focal, images)
+    return _of_resection(frame, names, found, sd_focal, images, camera, sd_focal_before)
 
 
 def _scale_reason(images: PointImages, resected: Callable[[PointImages], Resection]) -> str:
@@ -259,6 +294,8 @@ def _of_resection(
     found: Resection,
     sd_focal: float | None,
     images: PointImages,
+    camera: Camera,
+    sd_focal_before: float,
 ) -> FramePose:
     """Return a resection with the deviation of what all distances have in common."""
     # where all distances are off alike, images and positions alone tell how far away they are
@@ -278,6 +315,9 @@ def _of_resection(
         chi2=found.chi2,
         distance_scale=found.distance_scale,
         sd_distance_scale=sd_scale,
+        by_positions=position_slopes(
+            camera, images.chosen(found.is_used), found.pose, sd_focal_before
+        )[:6],
     )
 
 
@@ -285,27 +325,85 @@ def _count_words(count: int) -> str:
     return "no static target" if count == 0 else f"{count} static target{'s' * (count > 1)}"
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _AttitudeSample:
+    """How a plate lies, by one frame that other targets orient."""
+
+    enu_from_plate: FloatArray  # (3, 3)
+    cov: FloatArray  # (3, 3): what differs between frames, as in `PlateAttitude`
+    by_positions: Mapping[str, FloatArray]  # (3, 3): its turn by the other targets' positions
+
+
 def _plate_attitudes(
-    poses: Sequence[FramePose], by_frame: Mapping[str, Sequence[Sighting]]
+    poses: Sequence[FramePose],
+    by_frame: Mapping[str, Sequence[Sighting]],
+    positions: Mapping[str, TargetPosition],
+    camera: Camera,
+    rotations: Mapping[str, SceneRotation],
 ) -> dict[str, PlateAttitude]:
     """Return how plates lie, by the frames that were oriented without them being needed."""
-    samples: dict[str, list[FloatArray]] = {}
+    position_covs = {name: place.cov_m2 for name, place in positions.items()}
+    samples: dict[str, list[_AttitudeSample]] = {}
     for pose in poses:
-        if pose.pose is None:
-            continue
         for each in by_frame[pose.frame]:
-            if each.target in pose.used and _is_told_apart(each) and each.pose is not None:
-                attitude = pose.pose.world_from_camera @ each.pose.rotation
-                samples.setdefault(each.target, []).append(attitude)
-    plates = {}
-    for target, attitudes in samples.items():
-        if len(attitudes) >= _LEAST_PLATE_FRAMES:
-            plates[target] = _mean_attitude(np.array(attitudes))
-    return plates
+            if each.target in pose.used and _is_told_apart(each):
+                rotation = rotations.get(pose.frame)
+                sample = _attitude_sample(pose, each, position_covs, camera, rotation)
+                if sample is not None:
+                    samples.setdefault(each.target, []).append(sample)
+    return {
+        target: _mean_attitude(of_target, position_covs)
+        for target, of_target in samples.items()
+        if len(of_target) >= _LEAST_PLATE_FRAMES
+    }
 
 
-def _mean_attitude(attitudes: FloatArray) -> PlateAttitude:
-    """Return the mean of rotations (n, 3, 3) that scatter by little, without those far off."""
+def _attitude_sample(
+    frame: FramePose,
+    ring: Sighting,
+    position_covs: Mapping[str, FloatArray | None],
+    camera: Camera,
+    rotation: SceneRotation | None,
+) -> _AttitudeSample | None:
+    """Return how a ring's plate lies by a frame; None: one of the two poses lacks a part."""
+    if frame.pose is None or frame.cov is None or frame.by_positions is None:
+        return None
+    if ring.pose is None or ring.pose_cov is None:
+        return None
+    world_from_camera = frame.pose.world_from_camera
+    slopes = np.swapaxes(frame.by_positions[3:], 0, 1)
+    by_positions = dict(zip(frame.used, slopes, strict=True))
+    cov = frame.cov[3:, 3:] - _by_positions(by_positions, position_covs)
+    cov = cov + world_from_camera @ ring.pose_cov[3:, 3:] @ world_from_camera.T
+    readout = Readout.of(camera, ring.centre_px[None], rotation)
+    if readout is not None:
+        turn, turn_sd = _turn_until_row(frame.pose, readout)
+        world_from_camera = rotation_about(turn) @ world_from_camera
+        cov = cov + turn_sd**2 * np.eye(3)
+    return _AttitudeSample(world_from_camera @ ring.pose.rotation, cov, by_positions)
+
+
+def _by_positions(
+    slopes: Mapping[str, FloatArray], position_covs: Mapping[str, FloatArray | None]
+) -> FloatArray:
+    """Return the covariance (3, 3) of a turn by its slopes and what positions are off by."""
+    total = np.zeros((3, 3))
+    for name, slope in slopes.items():
+        position_cov = position_covs[name]
+        if position_cov is not None:
+            total += slope @ position_cov @ slope.T
+    return total
+
+
+def _mean_attitude(
+    samples: Sequence[_AttitudeSample], position_covs: Mapping[str, FloatArray | None]
+) -> PlateAttitude:
+    """Return the mean of samples that scatter by little, without those far off.
+
+    If they scatter more than they should, the mean is so much less certain. Errors of the targets'
+    positions are those of all samples.
+    """
+    attitudes = np.array([sample.enu_from_plate for sample in samples])
     middle = Rotation.from_matrix(attitudes).mean().as_matrix()
     for _ in range(3):
         off = Rotation.from_matrix(attitudes @ middle.T).as_rotvec()
@@ -313,9 +411,15 @@ def _mean_attitude(attitudes: FloatArray) -> PlateAttitude:
         kept = size <= 4.0 * max(float(np.median(size)), 1e-6)
         middle = Rotation.from_matrix(attitudes[kept]).mean().as_matrix()
     off = Rotation.from_matrix(attitudes[kept] @ middle.T).as_rotvec()
-    count = int(np.count_nonzero(kept))
-    cov = off.T @ off / max(1, count - 1) / count + 1e-10 * np.eye(3)
-    return PlateAttitude(middle, cov)
+    covs = np.array([sample.cov for sample in samples])[kept] + _LEAST_TURN_RAD**2 * np.eye(3)
+    slopes = {name: np.zeros((3, 3)) for name in position_covs}
+    for sample, is_kept in zip(samples, kept, strict=True):
+        for name, slope in sample.by_positions.items():
+            slopes[name] += is_kept * slope / len(off)
+    common_cov = _by_positions(slopes, position_covs)
+    chi2 = float(np.sum(off * np.linalg.solve(covs, off[..., None])[..., 0]))
+    factor = max(1.0, chi2 / (3.0 * max(1, len(off) - 1)))
+    return PlateAttitude(middle, factor * covs.sum(axis=0) / len(off) ** 2 + common_cov)
 
 
 def _is_told_apart(sighting: Sighting) -> bool:
@@ -329,6 +433,8 @@ def _by_ring(
     positions: Mapping[str, TargetPosition],
     plates: Mapping[str, PlateAttitude],
     sd_scale: float,
+    camera: Camera,
+    rotation: SceneRotation | None,
 ) -> FramePose:
     """Return the pose by the best of a frame's rings; the frame as it was, if there is none.
 
@@ -341,7 +447,8 @@ def _by_ring(
         made = _pose_by_ring(each, positions[each.target], plates[each.target], sd_scale)
         if made is None:
             continue
-        pose, cov = made
+        readout = Readout.of(camera, each.centre_px[None], rotation)
+        pose, cov = made if readout is None else _at_middle_row(*made, readout, each.distance_m)
         agreeing = [
             _agrees(other, positions[other.target], pose, cov)
             for other in sightings
@@ -363,6 +470,25 @@ def _by_ring(
         is_by_one_ring=True,
         margin=ring.ambiguity,
     )
+
+
+def _at_middle_row(
+    pose: CameraPose, cov: FloatArray, readout: Readout, distance_m: float
+) -> tuple[CameraPose, FloatArray]:
+    """Return pose and covariance at the moment of the frame, from those at the row of one point."""
+    turn, turn_sd = _turn_until_row(pose, readout)
+    by_motion = np.repeat([distance_m * turn_sd, turn_sd], 3) ** 2
+    return pose.moved(np.array([0.0, 0.0, 0.0, *-turn])), cov + np.diag(by_motion)
+
+
+def _turn_until_row(pose: CameraPose, readout: Readout) -> tuple[FloatArray, float]:
+    """Return how a camera turns (3,) from the middle row to that of one point, and how surely.
+
+    World axes [rad]. Where the scene turns one way, the camera turns the other way.
+    """
+    delay_s = float(readout.delay_s[0])
+    turn = -delay_s * pose.world_from_camera @ np.array(readout.rotation.velocity_rad_s)
+    return turn, readout.rotation.sd_rad_s * abs(delay_s)
 
 
 def _agrees(

@@ -8,7 +8,36 @@ from dataclasses import dataclass
 import numpy as np
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import rotation_about
+from kgcp.measurement.plate_prior import SceneRotation
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Readout:
+    """When a rolling shutter exposes n points, and how the scene turns meanwhile."""
+
+    delay_s: FloatArray  # (n,): after the middle row, which is the moment of the pose
+    rotation: SceneRotation
+
+    @classmethod
+    def of(
+        cls, camera: Camera, pixels: FloatArray, rotation: SceneRotation | None = None
+    ) -> Readout | None:
+        """Return that of points at raw pixels (n, 2); None: all are exposed at once.
+
+        Parameters
+        ----------
+        rotation : SceneRotation, optional
+            What is known of it; by default what the camera's settings say.
+        """
+        if not camera.readout_s:
+            return None
+        return cls(camera.delay_s(pixels), rotation or SceneRotation.unknown(camera))
+
+    def chosen(self, which: BoolArray) -> Readout:
+        """Return that of some of the points."""
+        return Readout(self.delay_s[which], self.rotation)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,6 +52,7 @@ class PointImages:
     sd_distances_m: FloatArray  # (n,)
     # of the logarithm of what all distances are off by alike: prints, focal length; 0: nothing
     sd_scale: float = 0.0
+    readout: Readout | None = None  # None: all points are exposed at the moment of the pose
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -37,7 +67,17 @@ class PointImages:
             self.distances_m[which],
             self.sd_distances_m[which],
             self.sd_scale,
+            None if self.readout is None else self.readout.chosen(which),
         )
+
+    @property
+    def motion_sd_rad(self) -> FloatArray:
+        """By how much each point may have turned (n,) since the moment of the pose."""
+        if self.readout is None:
+            return np.zeros(len(self))
+        velocity = np.array(self.readout.rotation.velocity_rad_s)
+        speed = math.hypot(float(np.linalg.norm(velocity)), self.readout.rotation.sd_rad_s)
+        return np.asarray(speed * np.abs(self.readout.delay_s))
 
     @property
     def has_distance(self) -> BoolArray:

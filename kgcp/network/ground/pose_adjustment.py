@@ -1,8 +1,14 @@
-"""The pose of one frame by least squares, with its covariance."""
+"""The pose of one frame by least squares, with its covariance.
+
+Some errors are those of all points together: distances may be too long by one factor (prints, focal
+length), and a rolling shutter's camera moves from row to row. They are unknowns with an a-priori
+deviation, and are eliminated.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import null_space
@@ -19,6 +25,55 @@ MOST_STEPS = 40
 _CONVERGED = 1e-5  # decrease of χ² that means nothing
 _ENDS_SD, _LEAST_RISE = 3.0, 0.5  # where a bend ends, and how much of χ² must rise until there
 _NO_DISTANCE = 1e6  # deviation of the logarithm of a distance that is not measured
+_DOUBTED_CHI2 = 9.0  # of a point that counts half for what all points have in common
+_COMMON_ROUNDS = 5  # of its reweighting
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Linearised:
+    """Observations of n points near a pose."""
+
+    # (n, 3): observed minus computed places [px] and logarithms of distances, NaN where they are
+    # not measured; what is known of the camera's motion is taken off
+    residuals: FloatArray
+    design: FloatArray  # (n, 3, 7): derivatives by the pose's step
+    by_point: FloatArray  # (n, 3, 3): … by the points' positions
+    common: FloatArray  # (n, 3, k): … by what all points have in common
+    precisions: FloatArray  # (k,): inverse a-priori variances of that
+
+    def chosen(self, which: BoolArray) -> _Linearised:
+        """Return some of the points."""
+        return replace(
+            self,
+            residuals=self.residuals[which],
+            design=self.design[which],
+            by_point=self.by_point[which],
+            common=self.common[which],
+        )
+
+
+def _linearised(camera: Camera, images: PointImages, pose: CameraPose) -> _Linearised:
+    """Return observations near a pose that has all points before it."""
+    residuals = _residuals(camera, images, pose)
+    design, by_point = _design(camera, images, pose)
+    parts, sds = [], []
+    if images.sd_scale:
+        of_distance = np.zeros((len(images), 3, 1))
+        of_distance[:, 2] = 1.0
+        parts.append(of_distance)
+        sds += [images.sd_scale]
+    if images.readout is not None:
+        # the camera moves on from its pose: a shift and a turn, each in proportion to the delay
+        by_motion = images.readout.delay_s[:, None, None] * design[:, :, :6]
+        parts.append(by_motion)
+        rotation = images.readout.rotation
+        sight_m = np.linalg.norm(images.positions_m - pose.centre_m, axis=1)
+        sds += [rotation.sd_rad_s * float(sight_m.mean())] * 3 + [rotation.sd_rad_s] * 3
+        # where the scene turns one way, the camera turns the other way
+        turn = -pose.world_from_camera @ np.array(rotation.velocity_rad_s)
+        residuals = residuals - by_motion[:, :, 3:] @ turn
+    common = np.concatenate(parts, axis=2) if parts else np.zeros((len(images), 3, 0))
+    return _Linearised(residuals, design, by_point, common, np.array(sds) ** -2.0)
 
 
 def _projected(
@@ -116,18 +171,20 @@ def squared_residuals(
     slack_px : float
         By which places may be off besides.
     """
-    residuals = _residuals(camera, images, pose)
-    ahead = np.isfinite(residuals[:, 0])
+    ahead = _is_ahead(images, pose)
     chi2 = np.full(len(images), np.inf)
     if ahead.any():
         kept = images.chosen(ahead)
-        _, by_point = _design(camera, kept, pose)
-        cov = _covariances(kept, by_point)
+        near = _linearised(camera, kept, pose)
+        cov = _covariances(kept, near.by_point)
         cov[:, :2, :2] += slack_px**2 * np.eye(2)
-        off = residuals[ahead]
-        off[:, 2] -= _scale(kept, off, cov)
-        chi2[ahead] = _chi2(off, cov)
+        chi2[ahead] = _chi2(near.residuals - near.common @ _in_common(kept, near, cov), cov)
     return chi2
+
+
+def _is_ahead(images: PointImages, pose: CameraPose) -> BoolArray:
+    """Return which points (n,) are in front of the camera."""
+    return np.asarray(pose.in_camera(images.positions_m)[:, 2] > 0.0)
 
 
 def minimised(
@@ -186,36 +243,36 @@ def _normal_equations(
     sd_focal: float,
 ) -> tuple[FloatArray, FloatArray, float]:
     """Return normal matrix, right-hand side and weighted squares; the focal length if unknown."""
-    residuals = _residuals(camera, images, pose)
     unknowns = 7 if sd_focal else 6
-    if not np.isfinite(residuals[:, 0]).all():
+    if not _is_ahead(images, pose).all():
         return np.eye(unknowns), np.zeros(unknowns), math.inf
-    design, by_point = _design(camera, images, pose)
-    design, known = design[:, :, :unknowns], np.nan_to_num(residuals)
-    cov = _covariances(images, by_point)
+    near = _linearised(camera, images, pose)
+    known = np.nan_to_num(near.residuals)[..., None]
+    both = np.concatenate((near.design[:, :, :unknowns], known, near.common), axis=2)
+    cov = _covariances(images, near.by_point)
     try:
-        solved = np.linalg.solve(cov, np.concatenate((design, known[..., None]), axis=2))
+        weighted = weights[:, None, None] * np.linalg.solve(cov, both)
     except np.linalg.LinAlgError:  # a step to where a point is in the camera
         return np.eye(unknowns), np.zeros(unknowns), math.inf
-    weighted = weights[:, None, None] * solved
-    normal = np.einsum("nmp,nmq->pq", design, weighted[..., :-1])
-    right = np.einsum("nmp,nm->p", design, weighted[..., -1])
-    cost = float(np.einsum("nm,nm->", known, weighted[..., -1]))
-    if images.sd_scale:
-        # what all distances are off by alike, as an unknown that is eliminated
-        row = weighted[:, 2]
-        coupling = row[:, :-1].sum(axis=0)
-        pull = float(row[:, -1].sum())
-        own = float(weights @ np.linalg.inv(cov)[:, 2, 2]) + images.sd_scale**-2.0
-        normal -= np.outer(coupling, coupling) / own
-        right -= coupling * pull / own
-        cost -= pull**2 / own
+    square = np.einsum("nmp,nmq->pq", both, weighted)
+    square = _without_common(square, near.precisions)
+    normal, right = square[:unknowns, :unknowns], square[:unknowns, unknowns]
+    cost = float(square[unknowns, unknowns])
     if sd_focal:
         off = math.log(pose.focal_scale)
         normal[6, 6] += 1.0 / sd_focal**2
         right[6] -= off / sd_focal**2
         cost += (off / sd_focal) ** 2
     return normal, right, cost
+
+
+def _without_common(square: FloatArray, precisions: FloatArray) -> FloatArray:
+    """Return products of columns without the last k, which are unknowns that are eliminated."""
+    kept = len(square) - len(precisions)
+    own = square[kept:, kept:] + np.diag(precisions)
+    return np.asarray(
+        square[:kept, :kept] - square[:kept, kept:] @ np.linalg.solve(own, square[kept:, :kept])
+    )
 
 
 def position_equations(
@@ -241,41 +298,95 @@ def position_equations(
         Weighted squares of the residuals, without corrections.
         None instead of the three: a point is behind the camera, or the pose is not determined.
     """
-    residuals = _residuals(camera, images, pose)
-    if not np.isfinite(residuals[:, 0]).all():
+    if not _is_ahead(images, pose).all():
         return None
-    count = len(images)
-    design, by_point = _design(camera, images, pose)
-    weights = np.linalg.inv(_covariances(images, np.zeros_like(by_point)))
+    near = _linearised(camera, images, pose)
+    exact = replace(images, position_cov=np.zeros_like(images.position_cov))
     unknowns = 7 if sd_focal else 6
-    by_pose = np.zeros((count, 3, unknowns + 1))
-    by_pose[:, :, :unknowns] = design[:, :, :unknowns]
-    by_pose[:, 2, unknowns] = 1.0  # what all distances are too long by, alike
-    prior = np.zeros(unknowns + 1)
-    prior[unknowns] = 1.0 / max(images.sd_scale, 1e-9) ** 2
+    off = np.nan_to_num(near.residuals)[..., None]
+    both = np.concatenate(
+        (_by_positions(near), off, near.design[:, :, :unknowns], near.common), axis=2
+    )
+    square = np.einsum(
+        "nmp,nmq->pq", both, np.linalg.solve(_covariances(exact, near.by_point), both)
+    )
+    of_pose = np.zeros(unknowns)
     if sd_focal:
-        prior[6] = 1.0 / sd_focal**2
-    by_position = np.zeros((count, 3, count, 3))
-    by_position[np.arange(count), :, np.arange(count)] = by_point
-    by_positions = by_position.reshape(count, 3, 3 * count)
-    both = np.concatenate((by_pose, by_positions, np.nan_to_num(residuals)[..., None]), axis=2)
-    square = np.einsum("nip,nij,njq->pq", both, weights, both)
-    eliminated = unknowns + 1
-    square[range(eliminated), range(eliminated)] += prior
+        of_pose[6] = 1.0 / sd_focal**2
     try:
-        solved = np.linalg.solve(square[:eliminated, :eliminated], square[:eliminated, eliminated:])
+        reduced = _without_common(square, np.concatenate((of_pose, near.precisions)))
     except np.linalg.LinAlgError:
         return None
-    reduced = square[eliminated:, eliminated:] - square[eliminated:, :eliminated] @ solved
     return reduced[:-1, :-1], reduced[:-1, -1], float(reduced[-1, -1])
+
+
+def _by_positions(near: _Linearised) -> FloatArray:
+    """Return the derivatives (n, 3, 3 n) of all observations by all positions."""
+    count = len(near.by_point)
+    by_position = np.zeros((count, 3, count, 3))
+    by_position[np.arange(count), :, np.arange(count)] = near.by_point
+    return by_position.reshape(count, 3, 3 * count)
+
+
+def position_slopes(
+    camera: Camera, images: PointImages, pose: CameraPose, sd_focal: float
+) -> FloatArray:
+    """Return how an adjusted pose follows its points' positions.
+
+    Returns
+    -------
+    (6, n, 3) or (7, n, 3) array
+        Derivatives of the pose's step by the positions.
+    """
+    near = _linearised(camera, images, pose)
+    unknowns = 7 if sd_focal else 6
+    both = np.concatenate((near.design[:, :, :unknowns], -_by_positions(near), near.common), axis=2)
+    weighted = np.linalg.solve(_covariances(images, near.by_point), both)
+    reduced = _without_common(np.einsum("nmp,nmq->pq", both, weighted), near.precisions)
+    normal, by_positions = reduced[:unknowns, :unknowns], reduced[:unknowns, unknowns:]
+    if sd_focal:
+        normal[6, 6] += 1.0 / sd_focal**2
+    return np.asarray(np.linalg.solve(normal, by_positions)).reshape(unknowns, len(images), 3)
 
 
 def scale_at(camera: Camera, images: PointImages, pose: CameraPose) -> float:
     """Return the logarithm of what all distances are too long by, alike; 0: they are not."""
-    if not images.sd_scale:
-        return 0.0
-    _, by_point = _design(camera, images, pose)
-    return _scale(images, _residuals(camera, images, pose), _covariances(images, by_point))
+    return float(common_at(camera, images, pose)[0][0]) if images.sd_scale else 0.0
+
+
+def common_at(camera: Camera, images: PointImages, pose: CameraPose) -> tuple[FloatArray, float]:
+    """Return what all points have in common (k,), and its squares over a-priori variances.
+
+    First what all distances are too long by, if that is unknown; then how the camera moves during
+    the readout, if that is.
+    """
+    near = _linearised(camera, images, pose)
+    amounts = _in_common(images, near, _covariances(images, near.by_point))
+    return amounts, float(near.precisions @ amounts**2)
+
+
+def _in_common(images: PointImages, near: _Linearised, cov: FloatArray) -> FloatArray:
+    """Return what all points have in common (k,), from their residuals.
+
+    Points with wrong names hardly count.
+    """
+    scale = [_scale(images, near.residuals, cov)] if images.sd_scale else []
+    amounts = np.zeros(len(near.precisions))
+    amounts[: len(scale)] = scale
+    if images.readout is None:
+        return amounts
+    # before anything is known of the motion, points may be off by all that it does
+    spread = near.common / np.sqrt(near.precisions)
+    wide = cov + spread @ np.swapaxes(spread, 1, 2)
+    known = np.nan_to_num(near.residuals)
+    both = np.concatenate((near.common, known[..., None]), axis=2)
+    products = np.swapaxes(near.common, 1, 2) @ np.linalg.solve(cov, both)
+    for stated in (wide, *[cov] * _COMMON_ROUNDS):
+        chi2 = _chi2(near.residuals - near.common @ amounts, stated)
+        weights = 1.0 / (1.0 + chi2 / _DOUBTED_CHI2)
+        normal = np.einsum("n,npq->pq", weights, products)
+        amounts = np.linalg.solve(normal[:, :-1] + np.diag(near.precisions), normal[:, -1])
+    return np.asarray(amounts)
 
 
 def _scale(images: PointImages, residuals: FloatArray, cov: FloatArray) -> float:
@@ -284,18 +395,21 @@ def _scale(images: PointImages, residuals: FloatArray, cov: FloatArray) -> float
     Points with wrong names hardly count: residuals far from the median have little weight.
     """
     known = images.has_distance & np.isfinite(residuals).all(axis=1)
-    if not images.sd_scale or not known.any():
+    if not known.any():
         return 0.0
     logs, variances = residuals[known, 2], cov[known, 2, 2]
     off = (logs - np.median(logs)) ** 2 / variances
-    weights = 1.0 / (variances * (1.0 + off / 9.0))
+    weights = 1.0 / (variances * (1.0 + off / _DOUBTED_CHI2))
     return float(weights @ logs / (weights.sum() + images.sd_scale**-2.0))
 
 
 def covariance_and_residuals(
     camera: Camera, images: PointImages, pose: CameraPose, used: BoolArray, sd_focal: float
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Return covariance, residuals and their squares; None: the pose is not determined."""
+    """Return covariance, residuals and their squares; None: the pose is not determined.
+
+    Residuals are those to the pose and to its motion, but not to what distances are too long by.
+    """
     kept = images.chosen(used)
     normal, _, _ = _normal_equations(camera, kept, pose, np.ones(len(kept)), sd_focal)
     scale = 1.0 / np.sqrt(np.diag(normal))
@@ -304,7 +418,12 @@ def covariance_and_residuals(
         return None
     cov = np.linalg.inv(unit) * np.outer(scale, scale)
     chi2 = squared_residuals(camera, images, pose, 0.0)
-    return 0.5 * (cov + cov.T), _residuals(camera, images, pose), chi2
+    residuals = _residuals(camera, images, pose)
+    if images.readout is not None:
+        near = _linearised(camera, images, pose)
+        amounts, _ = common_at(camera, kept, pose)
+        residuals = near.residuals - near.common[:, :, -6:] @ amounts[-6:]
+    return 0.5 * (cov + cov.T), residuals, chi2
 
 
 def bend_cov(

@@ -16,7 +16,8 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition
-from kgcp.network.ground.frame_poses import SD_FOCAL, FramePose, point_images
+from kgcp.measurement.plate_prior import SceneRotation
+from kgcp.network.ground.frame_poses import NO_ROTATIONS, SD_FOCAL, FramePose, point_images
 from kgcp.network.ground.pose_adjustment import position_equations
 
 _DOUBTFUL_CHI2 = 16.3  # of three coordinates: by chance once in 1000 targets
@@ -50,6 +51,7 @@ def wrong_position(
     positions: Mapping[str, TargetPosition],
     camera: Camera,
     sd_scale: float,
+    rotations: Mapping[str, SceneRotation] = NO_ROTATIONS,
 ) -> WrongPosition | None:
     """Return the position that the frames of a flight contradict most; None: none is doubtful.
 
@@ -63,7 +65,9 @@ def wrong_position(
     names = list(dict.fromkeys(name for used in of_frames for name in used))
     if not names:
         return None
-    normal, right, squares, freedom = _equations(poses, seen, positions, names, camera, sd_scale)
+    normal, right, squares, freedom = _equations(
+        poses, seen, positions, names, camera, sd_scale, rotations
+    )
     prior = np.zeros_like(normal)
     for row, name in enumerate(names):
         cov = positions[name].cov_m2
@@ -96,6 +100,7 @@ def _equations(
     names: Sequence[str],
     camera: Camera,
     sd_scale: float,
+    rotations: Mapping[str, SceneRotation],
 ) -> tuple[FloatArray, FloatArray, float, int]:
     """Return normal matrix, right-hand side, weighted squares and redundancy of all frames."""
     normal, right = np.zeros((3 * len(names), 3 * len(names))), np.zeros(3 * len(names))
@@ -104,7 +109,8 @@ def _equations(
         if pose.pose is None or pose.residuals is None:
             continue
         used = pose.used
-        images = point_images([seen[pose.frame, name] for name in used], positions, sd_scale)
+        sightings = [seen[pose.frame, name] for name in used]
+        images = point_images(sightings, positions, sd_scale, camera, rotations.get(pose.frame))
         has_free_focal = pose.sd_focal_scale is not None
         equations = position_equations(camera, images, pose.pose, SD_FOCAL * has_free_focal)
         if equations is None:

@@ -22,6 +22,7 @@ from kgcp.geometry.pose import rotation_about
 from kgcp.network.ground.point_images import CameraPose, PointImages
 from kgcp.network.ground.pose_adjustment import (
     bend_cov,
+    common_at,
     covariance_and_residuals,
     minimised,
     scale_at,
@@ -216,6 +217,7 @@ def _hypothesis_costs(
     mean_cov = np.trace(images.position_cov, axis1=1, axis2=2) / 3.0
     variance = (
         _START_PX**2
+        + images.motion_sd_rad**2 * camera.mean_focal_px**2
         + 0.5 * np.trace(images.pixel_cov, axis1=1, axis2=2)
         + mean_cov * (camera.mean_focal_px / distance) ** 2
     )
@@ -291,8 +293,7 @@ def _robust_fit(
         pose = moved
     chi2 = squared_residuals(camera, images, pose, 0.0)
     prior = (math.log(pose.focal_scale) / sd_focal) ** 2 if sd_focal else 0.0
-    if images.sd_scale:
-        prior += (scale_at(camera, images.chosen(used), pose) / images.sd_scale) ** 2
+    prior += common_at(camera, images.chosen(used), pose)[1]
     return float(np.sum(np.minimum(chi2, _REJECTED_CHI2))) + prior, pose, used
 
 

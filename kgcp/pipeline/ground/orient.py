@@ -203,6 +203,7 @@ def orient_flight(
     positions = data.target_positions
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
     sd_scale = print_scale_sd(flight.all_targets)
+    rotations = data.scene_rotations
     with np.errstate(all="ignore"):  # poses are tried anywhere: what is not finite is no result
         poses = orient_frames(
             frames,
@@ -212,8 +213,11 @@ def orient_flight(
             min_points=options.min_points,
             has_free_focal=options.has_free_focal,
             sd_scale=sd_scale,
+            rotations=rotations,
         )
-        wrong = wrong_position(poses, sightings, positions.static, flight.camera, sd_scale)
+        wrong = wrong_position(
+            poses, sightings, positions.static, flight.camera, sd_scale, rotations
+        )
     if not any(each.pose is not None for each in poses):
         reasons = Counter(each.reason for each in poses)
         reason, count = reasons.most_common(1)[0]

@@ -1,0 +1,208 @@
+"""Frames of a rolling shutter, whose rows see the targets from where the camera is by then."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.pose import Pose
+from kgcp.georef.sighting import Sighting
+from kgcp.georef.target_positions import TargetPosition
+from kgcp.measurement.plate_prior import SceneRotation
+from kgcp.network.ground.field_pose import orient_by_field
+from kgcp.network.ground.frame_poses import UNSTATED_SCALE_SD, FramePose, orient_frames
+from kgcp.network.ground.point_images import CameraPose
+from kgcp.network.ground.position_check import wrong_position
+from kgcp.targets.fields.points import AnyField
+from tests.ground_flight import CAMERA as GLOBAL_CAMERA
+from tests.ground_flight import GroundFlight
+from tests.network import test_field_pose as fields
+
+READOUT_S = 0.03
+CAMERA = replace(GLOBAL_CAMERA, readout_s=READOUT_S)
+SD_PX, SD_DISTANCE, SD_POSITION_M = 0.01, 2e-4, 0.002
+SD_RAD_S = float(np.radians(CAMERA.motion_sd_deg_s))
+NAMES = tuple("ABCDEF")
+OFFSETS_M = np.array(
+    [[-7, -5, 0], [7, -4.5, 0.5], [6.5, 5, -0.3], [-6, 5, 0.2], [0, -1.5, 0.4], [1, 2, 0]], float
+)
+
+
+def poses_at_rows(pose: CameraPose, motion: FloatArray, points_m: FloatArray) -> list[CameraPose]:
+    """Where the camera is when each point is exposed: shift [m/s] and turn [rad/s] after `pose`."""
+    poses = [pose] * len(points_m)
+    for _ in range(3):  # the row depends on the motion
+        seen = np.vstack(
+            [each.in_camera(point[None]) for each, point in zip(poses, points_m, strict=True)]
+        )
+        delays_s = READOUT_S * (CAMERA.project(seen)[:, 1] / (CAMERA.height - 1) - 0.5)
+        poses = [pose.moved(delay_s * motion) for delay_s in delays_s.tolist()]
+    return poses
+
+
+def sightings_of(
+    flight: GroundFlight,
+    row: int,
+    motion: FloatArray,
+    rng: np.random.Generator,
+    names: Sequence[str] = NAMES,
+) -> list[Sighting]:
+    """The targets of one frame, each with its pose at the moment of its row."""
+    start = CameraPose(flight.centres[row], flight.rotations[row])
+    made = []
+    for column, at_row in enumerate(poses_at_rows(start, motion, flight.positions)):
+        if flight.names[column] not in names:
+            continue
+        sight_m = at_row.in_camera(flight.positions[column][None])
+        pixel = CAMERA.project(sight_m)[0] + SD_PX * rng.standard_normal(2)
+        distance_m = float(np.linalg.norm(sight_m)) * (1.0 + SD_DISTANCE * rng.standard_normal())
+        turned = (
+            at_row.world_from_camera.T @ flight.rotations[row] @ flight.pose(row, column).rotation
+        )
+        ray = np.append(CAMERA.undistort(pixel[None])[0], 1.0)
+        made.append(
+            Sighting(
+                frame=flight.frame_names[row],
+                number=row + 1,
+                target=flight.names[column],
+                instance=0,
+                time_s=None,
+                centre_px=pixel,
+                centre_cov_px2=SD_PX**2 * np.eye(2),
+                distance_m=distance_m,
+                sd_distance_m=SD_DISTANCE * distance_m,
+                sd_common_distance_m=None,
+                pose=Pose(turned, distance_m * ray / np.linalg.norm(ray)),
+                pose_cov=np.diag([1e-4, 1e-4, SD_DISTANCE * distance_m, *[2e-5] * 3]) ** 2,
+            )
+        )
+    return made
+
+
+def drawn_motion(rng: np.random.Generator) -> FloatArray:
+    """As fast as the camera's settings say: the line of sight turns by either half."""
+    sds = np.repeat([29.0 * SD_RAD_S, SD_RAD_S], 3)
+    return np.asarray(sds * rng.standard_normal(6))
+
+
+def scene_rotation(
+    flight: GroundFlight, row: int, turn_rad_s: FloatArray, sd_rad_s: float
+) -> SceneRotation:
+    """How the scene turns where the camera turns in the world."""
+    x, y, z = (-flight.rotations[row].T @ turn_rad_s).tolist()
+    return SceneRotation((x, y, z), sd_rad_s)
+
+
+def error_of(found: FramePose, pose: CameraPose) -> FloatArray:
+    """The six errors over their deviations."""
+    assert found.pose is not None
+    assert found.cov is not None
+    turn = found.pose.world_from_camera @ pose.world_from_camera.T
+    odd = 0.5 * (turn - turn.T)
+    error = np.array([*(found.pose.centre_m - pose.centre_m), odd[2, 1], odd[0, 2], odd[1, 0]])
+    return np.asarray(error / np.sqrt(np.diag(found.cov)))
+
+
+def places_of(flight: GroundFlight, rng: np.random.Generator) -> dict[str, TargetPosition]:
+    stated_m = flight.positions + SD_POSITION_M * rng.standard_normal(flight.positions.shape)
+    cov_m2 = SD_POSITION_M**2 * np.eye(3)
+    pairs = zip(flight.names, stated_m, strict=True)
+    return {name: TargetPosition(place, cov_m2) for name, place in pairs}
+
+
+@pytest.mark.parametrize("targets", [4, 6])
+def test_unknown_motion_is_in_the_deviations(targets: int) -> None:
+    """Poses are those of the middle row; all targets agree and none is thought misplaced."""
+    rng, z, off_px = np.random.default_rng(5), [], []
+    for seed in range(4):
+        flight = GroundFlight(NAMES[:targets], OFFSETS_M[:targets], frames=8, seed=seed)
+        places = places_of(flight, rng)
+        sightings = []
+        for row in range(flight.frames):
+            sightings += sightings_of(flight, row, drawn_motion(rng), rng)
+        poses = orient_frames(flight.frame_names, sightings, places, CAMERA, sd_scale=0.0)
+        for row, found in enumerate(poses):
+            if found.pose is None:  # four points hardly determine some poses
+                continue
+            assert found.used == NAMES[:targets]
+            z.append(error_of(found, CameraPose(flight.centres[row], flight.rotations[row])))
+            assert found.residuals is not None
+            off_px.append(np.abs(found.residuals[:, :2]).max())
+        assert wrong_position(poses, sightings, places, CAMERA, UNSTATED_SCALE_SD) is None
+    assert len(z) >= 30
+    assert 0.8 < float(np.sqrt(np.mean(np.square(z)))) < 1.2
+    assert float(np.max(off_px)) < 1.0  # three pixels without the motion
+
+
+def test_the_camera_s_rates_make_poses_more_certain() -> None:
+    rng, sds, z = np.random.default_rng(6), [], []
+    for seed in range(4):
+        flight = GroundFlight(NAMES[:5], OFFSETS_M[:5], frames=6, seed=seed)
+        places = places_of(flight, rng)
+        sightings, rotations = [], {}
+        for row, frame in enumerate(flight.frame_names):
+            turn = 2.0 * SD_RAD_S * rng.standard_normal(3)
+            sightings += sightings_of(flight, row, np.append(np.zeros(3), turn), rng)
+            rotations[frame] = scene_rotation(flight, row, turn, 0.02 * SD_RAD_S)
+        for known in ({}, rotations):
+            poses = orient_frames(
+                flight.frame_names, sightings, places, CAMERA, sd_scale=0.0, rotations=known
+            )
+            assert all(found.cov is not None for found in poses)
+            sds.append([np.sqrt(found.cov[4, 4]) for found in poses if found.cov is not None])
+        z += [
+            error_of(found, CameraPose(flight.centres[row], flight.rotations[row]))
+            for row, found in enumerate(poses)
+        ]
+    assert float(np.median(sds[1::2])) < 0.7 * float(np.median(sds[::2]))
+    assert 0.7 < float(np.sqrt(np.mean(np.square(z)))) < 1.2
+
+
+@pytest.mark.parametrize("shift_sd_m_s", [0.0, 29.0 * SD_RAD_S])
+def test_a_ring_alone_is_seen_at_its_own_row(shift_sd_m_s: float) -> None:
+    """Its pose is brought to the middle row, if the camera's rates tell all of the motion."""
+    rng, z = np.random.default_rng(7), []
+    for seed in range(12):
+        flight = GroundFlight(NAMES[:4], OFFSETS_M[:4], frames=5, seed=seed)
+        motions = np.repeat([shift_sd_m_s, SD_RAD_S], 3) * rng.standard_normal((5, 6))
+        rotations = {
+            frame: scene_rotation(flight, row, motions[row, 3:], 1e-4)
+            for row, frame in enumerate(flight.frame_names)
+        }
+        sightings = []
+        for row in range(5):
+            names = NAMES[:1] if row == 4 else NAMES[:4]
+            sightings += sightings_of(flight, row, motions[row], rng, names)
+        places = places_of(flight, rng)
+        found = orient_frames(
+            flight.frame_names,
+            sightings,
+            places,
+            CAMERA,
+            sd_scale=0.0,
+            rotations={} if shift_sd_m_s else rotations,
+        )[4]
+        assert found.is_by_one_ring
+        z.append(error_of(found, CameraPose(flight.centres[4], flight.rotations[4])))
+    assert 0.5 < float(np.sqrt(np.mean(np.square(z)))) < 1.2
+
+
+@pytest.mark.parametrize("field", [fields.BOARD, fields.POSTS], ids=["board", "posts"])
+def test_fields_in_frames_of_a_moving_camera(field: AnyField) -> None:
+    rng, z = np.random.default_rng(8), []
+    rolling = replace(fields.CAMERA, readout_s=READOUT_S)
+    for _ in range(12):
+        pose = fields.drawn_pose(rng)
+        which, moments, covs = fields.images(field, pose, rng)
+        motion = np.repeat([0.45 * SD_RAD_S, SD_RAD_S], 3) * rng.standard_normal(6)
+        delays_s = READOUT_S * (moments[:, 1] / (rolling.height - 1) - 0.5)
+        still = fields.CAMERA.project(pose.in_camera(field.points_m()))
+        for index, point in enumerate(field.points_m()):
+            moved = pose.moved(delays_s[index] * motion).in_camera(point[None])
+            moments[index, :2] += fields.CAMERA.project(moved)[0] - still[index]
+        z.append(fields.error_of(orient_by_field(rolling, field, which, moments, covs), pose))
+    assert 0.75 < float(np.sqrt(np.mean(np.square(z)))) < 1.25
