@@ -1,13 +1,16 @@
-"""How fast a target goes by while a rolling shutter reads a frame, from the frames around it.
+"""How a camera moves while a rolling shutter reads a frame, from the frames around it.
 
 Reference poses and the target's positions give the direction of the target in the camera frame at
 the times of the frames; differences over time give its rotation at each. Their uncertainty follows
-from the comparison with differences over twice the time.
+from the comparison with differences over twice the time. The same is done for the camera's shift
+and turn in the world.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,7 +20,21 @@ from kgcp.measurement.plate_prior import SceneRotation
 
 _NEAREST = 8  # frames from which the uncertainty of a rotation is estimated
 _FEWEST = 4
-_UNSEEN_SHARE = 0.2  # of the a-priori deviation: vibration that is too fast for frames to show
+# Of the a-priori deviation: vibration that is too fast for frames to show. It turns a camera far
+# more than it shifts one: at 5°/s and 30 m, the latter is 0.1 m/s.
+_UNSEEN_SHARE, _UNSEEN_SHARE_OF_SHIFTS = 0.2, 0.04
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraMotions:
+    """How a camera moves in the ENU frame at n frames."""
+
+    velocity_m_s: FloatArray  # (n, 3): of the projection centre
+    sd_velocity_m_s: FloatArray  # (n,): of each component
+    turn_rad_s: FloatArray  # (n, 3): of the camera axes
+    sd_turn_rad_s: FloatArray  # (n,)
+    # (n,): whether poses before and after tell the motion; else its error is that of all frames
+    is_seen: BoolArray
 
 
 def combine(observed_rad_s: FloatArray, sd_rad_s: float, a_priori: SceneRotation) -> SceneRotation:
@@ -53,26 +70,101 @@ def rotations_between_frames(
         For frames without neighbours on both sides, and in flights with too few frames to compare,
         it is the a-priori one.
     """
-    count = len(time_s)
     near, is_near = _differences(time_s, sight_m, camera_from_plate, 1)
     wide, is_wide = _differences(time_s, sight_m, camera_from_plate, 2)
+    before = [a_priori] * len(time_s)
+    return _believed(time_s, near, is_near, wide, is_wide, before, _UNSEEN_SHARE)
+
+
+def camera_motions(
+    time_s: FloatArray,
+    centre_m: FloatArray,
+    enu_from_camera: FloatArray,
+    turns: Sequence[SceneRotation],
+    distance_m: float,
+) -> CameraMotions:
+    """Return shift and turn of a camera at n frames, by central differences over its poses.
+
+    Parameters
+    ----------
+    time_s : (n,) array
+        Mid-exposures [s], in any order; NaN: not known.
+    centre_m, enu_from_camera : (n, 3) and (n, 3, 3) arrays
+        As of `ExteriorOrientations`.
+    turns : sequence of SceneRotation
+        How the scene turns about the camera, as far as that is known without the poses. By its
+        deviation times the distance, the shift is zero.
+    distance_m : float
+        To what is seen, about.
+    """
+    sds = np.array([turn.sd_rad_s for turn in turns])
+    # the camera turns the other way
+    turn = -np.einsum("nij,nj->ni", enu_from_camera, [turn.velocity_rad_s for turn in turns])
+    velocity, sd_velocity = np.zeros_like(turn), sds * distance_m
+    sd_turn, is_seen = sds.copy(), np.zeros(len(sds), dtype=np.bool_)
+    known = np.flatnonzero(np.isfinite(time_s))
+    rows = known[np.unique(time_s[known], return_index=True)[1]]  # one frame per time
+    at_s, centres, axes = time_s[rows], centre_m[rows], enu_from_camera[rows]
+    near, is_near = _shifts_and_turns(at_s, centres, axes, 1)
+    wide, is_wide = _shifts_and_turns(at_s, centres, axes, 2)
+    before = [SceneRotation(tuple(turn[row].tolist()), float(sds[row])) for row in rows]
+    turned = _believed(at_s, near[:, 3:], is_near, wide[:, 3:], is_wide, before, _UNSEEN_SHARE)
+    # as angles at the distance, shifts are of the same kind
+    still = [SceneRotation((0.0, 0.0, 0.0), float(sds[row])) for row in rows]
+    near, wide = near[:, :3] / distance_m, wide[:, :3] / distance_m
+    shifted = _believed(at_s, near, is_near, wide, is_wide, still, _UNSEEN_SHARE_OF_SHIFTS)
+    for row, turned_one, shifted_one in zip(rows, turned, shifted, strict=True):
+        turn[row], sd_turn[row] = turned_one.velocity_rad_s, turned_one.sd_rad_s
+        velocity[row] = np.multiply(distance_m, shifted_one.velocity_rad_s)
+        sd_velocity[row] = distance_m * shifted_one.sd_rad_s
+        is_seen[row] = shifted_one.sd_rad_s < sds[row]
+    return CameraMotions(velocity, sd_velocity, turn, sd_turn, is_seen)
+
+
+def _believed(
+    time_s: FloatArray,
+    near: FloatArray,
+    is_near: BoolArray,
+    wide: FloatArray,
+    is_wide: BoolArray,
+    a_priori: Sequence[SceneRotation],
+    unseen_share: float,
+) -> list[SceneRotation]:
+    """Return rates by differences (n, 3) over near neighbours, as good as wide ones agree."""
     compared = np.flatnonzero(is_near & is_wide)
     if len(compared) < _FEWEST:
-        return [a_priori] * count
+        return [*a_priori]
     off2 = np.mean((near - wide)[compared] ** 2, axis=1)
     rotations = []
-    for row in range(count):
+    for row, before in enumerate(a_priori):
         if not is_near[row]:
-            rotations.append(a_priori)
+            rotations.append(before)
             continue
         # times ascend: the nearest frames are among as many on either side
         place = int(np.searchsorted(compared, row))
         around = np.arange(max(place - _NEAREST, 0), min(place + _NEAREST, len(compared)))
         order = np.argsort(np.abs(time_s[compared[around]] - time_s[row]), kind="stable")
         nearest = around[order[:_NEAREST]]
-        sd = math.hypot(math.sqrt(float(off2[nearest].mean())), _UNSEEN_SHARE * a_priori.sd_rad_s)
-        rotations.append(combine(near[row], sd, a_priori))
+        sd = math.hypot(math.sqrt(float(off2[nearest].mean())), unseen_share * before.sd_rad_s)
+        rotations.append(combine(near[row], sd, before))
     return rotations
+
+
+def _shifts_and_turns(
+    time_s: FloatArray, centre_m: FloatArray, enu_from_camera: FloatArray, reach: int
+) -> tuple[FloatArray, BoolArray]:
+    """Return velocities and turns (n, 6) from so many frames before to as many after."""
+    count = len(time_s)
+    rates, exists = np.zeros((count, 6)), np.zeros(count, dtype=np.bool_)
+    if count <= 2 * reach:
+        return rates, exists
+    before, after, inner = slice(None, -2 * reach), slice(2 * reach, None), slice(reach, -reach)
+    turned = enu_from_camera[after] @ np.swapaxes(enu_from_camera[before], 1, 2)
+    moved = np.hstack(
+        (centre_m[after] - centre_m[before], Rotation.from_matrix(turned).as_rotvec())
+    )
+    rates[inner], exists[inner] = moved / (time_s[after] - time_s[before])[:, None], True
+    return rates, exists
 
 
 def _differences(

@@ -62,6 +62,22 @@ def test_targets_are_placed_and_their_diameters_measured(tmp_path: Path) -> None
     assert page.count('<li class="look">') == 4, "the diameters, and not the places"
 
 
+@pytest.mark.usefixtures("_no_figures")
+def test_a_rolling_shutter_needs_times(tmp_path: Path) -> None:
+    """What the camera moves while a frame is read is not known, and the deviations say so."""
+    folder = GroundFlight().write(tmp_path / "flight")
+    still = json.loads(run(folder, "--json").stdout)["targets"][0]
+    settings = folder / "flight.toml"
+    text = settings.read_text(encoding="utf-8")
+    settings.write_text(text.replace("[camera]", "[camera]\nreadout_s = 0.03"), encoding="utf-8")
+    result = run(folder, "--json")
+    assert result.exit_code == 0, result.stderr
+    assert "the standard deviations assume 5°/s (motion_sd_deg_s); give times" in result.stderr
+    target = json.loads(result.stdout)["targets"][0]
+    assert target["sd_position_m"][2] > 5.0 * still["sd_position_m"][2]
+    assert target["frames_used"] == 12
+
+
 def test_a_wrong_frame_is_left_out_and_named(tmp_path: Path) -> None:
     flight = GroundFlight(wrong={(3, "B"): np.array([0.4, 0.0, 0.0])})
     folder = flight.write(tmp_path / "flight")

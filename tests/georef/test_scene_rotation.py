@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.scene_rotation import combine, rotations_between_frames
+from kgcp.georef.scene_rotation import camera_motions, combine, rotations_between_frames
 from kgcp.measurement.plate_prior import SceneRotation
 
 A_PRIORI = SceneRotation((0.0, 0.0, 0.0), math.radians(5.0))
@@ -59,3 +59,30 @@ def test_two_sources_are_weighted() -> None:
     rotation = combine(np.array([0.1, 0.0, -0.2]), A_PRIORI.sd_rad_s, A_PRIORI)
     assert rotation.velocity_rad_s == pytest.approx((0.05, 0.0, -0.1))
     assert rotation.sd_rad_s == pytest.approx(A_PRIORI.sd_rad_s / math.sqrt(2.0))
+
+
+def test_a_camera_s_shift_and_turn_are_found_between_its_poses() -> None:
+    """In any order of the frames; without times, what is known before remains."""
+    velocity_m_s, turn_rad_s = np.array([7.0, -2.0, 0.5]), np.array([0.03, -0.05, 0.02])
+    enu_from_camera = Rotation.from_rotvec(TIME_S[:, None] * turn_rad_s).as_matrix()
+    centre_m = TIME_S[:, None] * velocity_m_s
+    order = np.random.default_rng(3).permutation(len(TIME_S))
+    time_s = TIME_S[order]
+    time_s[order == 9] = math.nan
+    rate = SceneRotation((0.1, 0.2, -0.3), math.radians(0.5))
+    turns = [rate if row == 0 else A_PRIORI for row in order]
+    motions = camera_motions(time_s, centre_m[order], enu_from_camera[order], turns, 25.0)
+    for row, place in enumerate(order):
+        if 0 < place < 8:
+            assert motions.is_seen[row]
+            assert motions.velocity_m_s[row] == pytest.approx(velocity_m_s, rel=0.01)
+            assert motions.sd_velocity_m_s[row] == pytest.approx(0.087, rel=0.05)
+            assert motions.turn_rad_s[row] == pytest.approx(turn_rad_s, rel=0.05)
+            assert motions.sd_turn_rad_s[row] == pytest.approx(math.radians(1.0), rel=0.05)
+        else:
+            assert not motions.is_seen[row]
+            assert not motions.velocity_m_s[row].any()
+            assert motions.sd_velocity_m_s[row] == pytest.approx(25.0 * turns[row].sd_rad_s)
+        if place == 0:  # the camera turns the other way than the scene
+            turn = -enu_from_camera[0] @ rate.velocity_rad_s
+            assert motions.turn_rad_s[row] == pytest.approx(turn)

@@ -25,6 +25,9 @@ class CircleViews:
     # (n, 6, 6): of the exterior orientations: position [m] and left rotation vector [rad], in the
     # world's axes; None: they are exact
     exterior_cov: FloatArray | None = None
+    # (n, 6, 6): what six independent errors, with a deviation of 1 and alike in all frames, do to
+    # the exterior orientations; they are in `exterior_cov` as well; None: there are none
+    common_effects: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.moments)
@@ -37,6 +40,7 @@ class CircleViews:
             self.moments[which],
             self.cov[which],
             None if self.exterior_cov is None else self.exterior_cov[which],
+            None if self.common_effects is None else self.common_effects[which],
         )
 
 

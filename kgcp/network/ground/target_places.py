@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.attitude import ReferencePoses
@@ -22,6 +23,7 @@ from kgcp.geometry.circle_image import Circles3D, circle_slopes
 from kgcp.geometry.pose import Pose
 from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.local_frame import LocalFrame
+from kgcp.georef.scene_rotation import CameraMotions
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import static_position
 from kgcp.network.ground.circles_together import MovedCircleError, place_circles
@@ -206,6 +208,7 @@ def place_targets(
     *,
     min_frames: int,
     has_exact_poses: bool,
+    motions: CameraMotions | None = None,
 ) -> Placement:
     """Place targets from all their sightings in frames with a reference pose.
 
@@ -221,6 +224,8 @@ def place_targets(
         Least number of frames.
     has_exact_poses : bool
         Whether the deviations of the reference poses are disregarded.
+    motions : CameraMotions, optional
+        At the reference poses, of a rolling shutter's camera.
     """
     orientations = ExteriorOrientations.of(poses, local_frame)
     exterior_cov = None if has_exact_poses else _exterior_cov(poses, orientations)
@@ -235,17 +240,16 @@ def place_targets(
             continue
         at = [rows[each.frame] for each in posed]
         moments, cov = _images(camera, posed, 0.5 * target.outer_diameter_m)
+        views = CircleViews(
+            orientations.centre_m[at],
+            orientations.enu_from_camera[at],
+            moments,
+            cov,
+            None if exterior_cov is None else exterior_cov[at],
+        )
         usable.append(target)
         all_frames.append(tuple(each.frame for each in posed))
-        all_views.append(
-            CircleViews(
-                orientations.centre_m[at],
-                orientations.enu_from_camera[at],
-                moments,
-                cov,
-                None if exterior_cov is None else exterior_cov[at],
-            )
-        )
+        all_views.append(views if motions is None else _at_their_rows(camera, views, motions, at))
     outcomes, noise = place_circles(camera, all_views)
     placed = []
     for target, frames, views, outcome in zip(usable, all_frames, all_views, outcomes, strict=True):
@@ -278,6 +282,31 @@ def place_targets(
             common = common + (np.count_nonzero(outcome.fit.is_used) - 1.0) * outcome.fit.cov
         placed.append(_on_the_map(target, frames, outcome, own_px, common, local_frame))
     return Placement(tuple(placed), skipped, noise)
+
+
+def _at_their_rows(
+    camera: Camera, views: CircleViews, motions: CameraMotions, at: Sequence[int]
+) -> CircleViews:
+    """Return views from where a rolling shutter's camera is when the circle's row is exposed.
+
+    A motion that no poses tell is mostly the same in all frames: flown with the same speed.
+    """
+    delay_s = camera.delay_s(views.moments[:, :2])
+    turns = delay_s[:, None] * motions.turn_rad_s[at]
+    effects = np.zeros((len(at), 6, 6))
+    effects[:, :3, :3] = (delay_s * motions.sd_velocity_m_s[at])[:, None, None]
+    effects[:, 3:, 3:] = (delay_s * motions.sd_turn_rad_s[at])[:, None, None]
+    effects[:, :3, :3] *= views.world_from_camera
+    effects[:, 3:, 3:] *= views.world_from_camera
+    cov = effects @ np.swapaxes(effects, 1, 2)
+    is_common = ~motions.is_seen[at]
+    return replace(
+        views,
+        camera_m=views.camera_m + delay_s[:, None] * motions.velocity_m_s[at],
+        world_from_camera=Rotation.from_rotvec(turns).as_matrix() @ views.world_from_camera,
+        exterior_cov=cov if views.exterior_cov is None else views.exterior_cov + cov,
+        common_effects=effects * is_common[:, None, None] if is_common.any() else None,
+    )
 
 
 def _moved(move: Split, frames: Sequence[str]) -> TargetMove:

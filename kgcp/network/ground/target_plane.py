@@ -223,9 +223,10 @@ def common_covariance(
 ) -> FloatArray:
     """Return the covariance (6, 6) of what all frames have alike, and averaging does not reduce.
 
-    Three errors: the calibration's; edges that are displaced in all images by as many pixels; and
-    a shift of all projection centres, as large as their mean covariance says: how much of it is
-    common is not known, an adjustment that hangs on few control points shifts as a whole.
+    Four errors: the calibration's; edges that are displaced in all images by as many pixels; a
+    shift of all projection centres, as large as their mean covariance says: how much of it is
+    common is not known, an adjustment that hangs on few control points shifts as a whole; and the
+    common errors of `views`.
 
     Parameters
     ----------
@@ -253,6 +254,10 @@ def common_covariance(
     common += np.outer(by_edge, by_edge)
     if kept.exterior_cov is not None:
         common[:3, :3] += kept.exterior_cov[:, :3, :3].mean(axis=0)
+    if kept.common_effects is not None:
+        by_exterior = _moments_by_exterior(camera, kept, fit.circle)
+        by_errors = gain @ (by_exterior @ kept.common_effects).reshape(-1, 6)
+        common += by_errors @ by_errors.T
     return common
 
 
@@ -412,21 +417,26 @@ def total_covariances(
 
 
 def _stated(camera: Camera, views: CircleViews, circle: SpaceCircle) -> FloatArray:
-    """Return the stated covariances (n, 5, 5): of the images, and of the exterior orientations.
+    """Return the stated covariances (n, 5, 5): of the images, and of the exterior orientations."""
+    if views.exterior_cov is None:
+        return views.cov
+    by_exterior = _moments_by_exterior(camera, views, circle)
+    share = by_exterior @ views.exterior_cov @ np.swapaxes(by_exterior, 1, 2)
+    return np.asarray(views.cov + np.nan_to_num(share))
+
+
+def _moments_by_exterior(camera: Camera, views: CircleViews, circle: SpaceCircle) -> FloatArray:
+    """Return the derivatives (n, 5, 6) of the moments by the exterior orientations.
 
     With R' = exp(ω) R and C' = C + δ, the circle moves in the camera's frame by
     Rᵀ((X − C) × ω − δ), and turns by −Rᵀ ω.
     """
-    if views.exterior_cov is None:
-        return views.cov
     slopes = circle_slopes(camera, circle.in_cameras(views))
     camera_from_world = np.swapaxes(views.world_from_camera, 1, 2)
     by_place = slopes.by_centre @ camera_from_world
     by_turn = by_place @ cross_matrix(circle.centre_m - views.camera_m)
     by_turn = by_turn - slopes.by_rotation @ camera_from_world
-    by_exterior = np.concatenate((-by_place, by_turn), axis=2)
-    share = by_exterior @ views.exterior_cov @ np.swapaxes(by_exterior, 1, 2)
-    return np.asarray(views.cov + np.nan_to_num(share))
+    return np.concatenate((-by_place, by_turn), axis=2)
 
 
 def _excess(

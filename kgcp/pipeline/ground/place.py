@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +12,10 @@ import numpy as np
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.attitude import ReferencePoses
+from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.gcp import Gcp, build_gcps
 from kgcp.georef.local_frame import LocalFrame
+from kgcp.georef.scene_rotation import CameraMotions, camera_motions
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.io.exporters.points import MapPoints
@@ -30,6 +33,7 @@ from kgcp.io.tables.places import (
     residual_rows,
 )
 from kgcp.io.tables.provenance import derived_provenance
+from kgcp.measurement.plate_prior import SceneRotation
 from kgcp.network.ground.target_places import PlacedTarget, Placement, TargetMove, place_targets
 from kgcp.network.ground.target_plane import MOST_EXTRA_PX
 from kgcp.pipeline.execution.threads import single_threaded
@@ -89,6 +93,8 @@ class FlightPlaces:
         Of the places.
     provenance : mapping of str
         The metadata of the tables.
+    motions : CameraMotions or None
+        Of the camera of a rolling shutter.
     """
 
     flight: Flight
@@ -96,6 +102,7 @@ class FlightPlaces:
     sightings: tuple[Sighting, ...]
     local_frame: LocalFrame
     provenance: Mapping[str, str]
+    motions: CameraMotions | None = None
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -109,8 +116,24 @@ class FlightPlaces:
     def doubts(self) -> tuple[str, ...]:
         """What to look at before the places are used."""
         doubts = [doubt for placed in self.placement.targets for doubt in doubts_of(placed)]
-        of_all = (step_sentence(self.placement), noise_sentence(self.placement))
+        of_all = (
+            step_sentence(self.placement),
+            noise_sentence(self.placement),
+            self._motion_sentence,
+        )
         return (*doubts, *(sentence for sentence in of_all if sentence))
+
+    @property
+    def _motion_sentence(self) -> str:
+        """What is not known of the camera's motion; empty: it is known, or does not matter."""
+        sd_deg_s = self.flight.camera.motion_sd_deg_s
+        if self.motions is None or self.motions.is_seen.any():
+            return ""
+        return (
+            "poses and times do not tell how the camera moves while its rolling shutter reads a"
+            f" frame: the standard deviations assume {sd_deg_s:g}°/s (motion_sd_deg_s); give times"
+            " to the frames"
+        )
 
     def gcps(self) -> tuple[Gcp, ...]:
         """Return a ground control point for every sighting that took part, at the placed target."""
@@ -167,6 +190,8 @@ def place_flight(
     poses = _poses(flight, data, options.poses, [attempt.frame for attempt in attempts])
     local_frame = _local_frame(flight, poses)
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
+    time_s = {attempt.frame: attempt.time_s for attempt in attempts}
+    motions = _motions(flight, data, poses, local_frame, time_s, sightings)
     with np.errstate(all="ignore"):  # circles are tried anywhere: what is not finite is no result
         placement = place_targets(
             sightings,
@@ -177,6 +202,7 @@ def place_flight(
             flight.calibration_covariance,
             min_frames=options.min_frames,
             has_exact_poses=options.has_exact_poses,
+            motions=motions,
         )
     _require_fit(placement, flight, options.poses)
     choices = {
@@ -188,7 +214,30 @@ def place_flight(
         flight, table, choices, has_reference=options.poses is None and data.has_reference
     )
     used = _used_sightings(placement, sightings)
-    return FlightPlaces(flight, placement, used, local_frame, provenance)
+    return FlightPlaces(flight, placement, used, local_frame, provenance, motions)
+
+
+def _motions(
+    flight: Flight,
+    data: FlightData,
+    poses: ReferencePoses,
+    local_frame: LocalFrame,
+    time_s: Mapping[str, float | None],
+    sightings: Sequence[Sighting],
+) -> CameraMotions | None:
+    """Return how the camera moves while frames with reference poses are read; None: at once."""
+    if not flight.camera.readout_s or not sightings:
+        return None
+    orientations = ExteriorOrientations.of(poses, local_frame)
+    times = [time_s.get(frame) for frame in poses.frames]
+    unknown, rates = SceneRotation.unknown(flight.camera), data.scene_rotations
+    return camera_motions(
+        np.array([math.nan if time is None else time for time in times]),
+        orientations.centre_m,
+        orientations.enu_from_camera,
+        [rates.get(frame, unknown) for frame in poses.frames],
+        float(np.median([sighting.distance_m for sighting in sightings])),
+    )
 
 
 def _require_fit(placement: Placement, flight: Flight, poses: Path | None) -> None:
