@@ -217,10 +217,10 @@ def test_pixels_beside_edges_tie_the_levels_of_large_rings_together(
 def test_dirt_on_a_small_ring_is_told_by_its_edges(
     photograph: Photograph, start_near: StartNear, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Cells of 8 px say too little there, and the light was taken for even: 0.2 % off."""
-    rng = np.random.default_rng(39)
+    """Cells of 8 px say too little there, and the light was taken for even: 0.12 % off."""
+    rng = np.random.default_rng(38)
     pose = some_pose(rng)
-    pose = Pose(pose.rotation, 3.0 * pose.translation_m)
+    pose = Pose(pose.rotation, 3.5 * pose.translation_m)
     grey = photograph(LENS, pose, rng, gain=0.65, field=dirt(rng))
     start = start_near(LENS, pose, rng)
     seen = measure_by_model(grey, LENS, TARGET_PLATE.target, start)

@@ -34,8 +34,9 @@ _MAX_ANISOTROPY = 0.95
 _STEPS = 12
 _ENOUGH = 0.02  # of log-likelihood, promised by a step
 _LITTLE = 1e-4  # of a step
-_NOISE_ROUNDS, _SETTLED_NOISE = 3, 0.05
+_NOISE_ROUNDS, _SETTLED_NOISE = 8, 0.02
 _LEAST_RESIDUAL_SHARE = 0.25  # of a pixel's variance, that a fit leaves in its residual
+_LEAST_FREEDOM = 4.0  # of that of an edge
 _CLIP_SIGMAS = 2.5  # a pixel whose model is nearer to a clipping limit tells nothing of the noise
 _FEWEST_OF_NOISE = 8  # pixels
 # Of the range between the limits. Beyond, residuals are not noise but what the model lacks: a wider
@@ -403,6 +404,19 @@ class DiscFit:
         return float(np.sum(1.0 - self.leverage[~self.sample.censoring.is_clipped]))
 
     @property
+    def noise_freedom(self) -> float:
+        """Degrees of freedom from which the noise of the edge's pixels was estimated.
+
+        Both plateaus tell it, unless one is clipped: then the edge itself does, if it has enough
+        pixels.
+        """
+        seen = ~self.sample.censoring.is_clipped
+        is_edge = seen & (self.share > 0.2) & (self.share < 0.8)
+        if not self.sample.is_burnt or np.count_nonzero(is_edge) < _FEWEST_OF_NOISE:
+            return self.redundancy
+        return max(float(np.sum(1.0 - self.leverage[is_edge])), _LEAST_FREEDOM)
+
+    @property
     def noise(self) -> GreyNoise:
         """The noise that the residuals show, allowing for what the fit has taken from them.
 
@@ -425,11 +439,13 @@ def fit_disc(sample: DiscSample, start: DiscState, free: DiscUnknowns) -> DiscFi
         raise NoFit
     linear = _linearised(sample, state)
     sd = _noise(sample, linear.share, linear.levels).sd
+    seen = ~sample.censoring.is_clipped  # most of a burnt disc is not
     for _ in range(_NOISE_ROUNDS):
         fit = _minimise(sample, state, free, sd, linear)
         state, linear = fit.state, _Linear(fit.share, fit.levels, fit.jacobian)
         before, sd = sd, fit.noise.sd
-        if abs(float(sd.sum() / before.sum()) - 1.0) < _SETTLED_NOISE:
+        changes = np.abs(np.log(sd[seen] / before[seen]))
+        if changes.sum() <= _SETTLED_NOISE * len(changes):
             break
     return fit
 

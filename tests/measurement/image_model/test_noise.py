@@ -104,6 +104,20 @@ def test_noise_follows_the_level() -> None:
     assert np.std(found, axis=0)[0] < 0.1 * 0.008
 
 
+@pytest.mark.parametrize("from_edges", ["of both plateaus", "of ink and edges"])
+def test_noise_of_ink_is_that_of_no_share_of_plate(from_edges: str) -> None:
+    """Plateaus have a little of the other one in them, whose noise is six times as large."""
+    rng, found = np.random.default_rng(13), []
+    for _ in range(60):
+        share = np.concatenate((0.12 * rng.random(900), 0.2 + 0.6 * rng.random(600), np.ones(600)))
+        variance = 0.004**2 + share * (0.010**2 - 0.004**2)
+        usable = share < 1.0 if from_edges == "of ink and edges" else np.ones(len(share), bool)
+        residuals = rng.normal(0.0, np.sqrt(variance))
+        noise = estimate_noise(residuals, share, usable, COUNT / 10.0, from_edges=True)
+        found.append((noise.plateau_sd[:900] ** 2 / variance[:900]).mean())
+    assert float(np.mean(found)) == pytest.approx(1.0, abs=0.02)
+
+
 def test_bands_of_many_pixels_have_their_own_noise_and_others_follow_the_line() -> None:
     """Demosaicing makes the dark side of edges three times as noisy."""
     rng = np.random.default_rng(12)
