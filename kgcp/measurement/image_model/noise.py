@@ -26,6 +26,9 @@ _MIN_NOISE_COUNTS = 0.3  # quantisation alone: 1/√12 of a grey value
 _TRIM = 0.9
 _TRIMMED_VARIANCE = 0.6230  # of a unit normal variable within its central 90 %
 _MIN_SAMPLES = 8
+# Of the variance of ink, that plate may have in it. What jagged edges scatter is not that: without
+# a limit, the noise of ink was taken for none, and a tone curve did not settle.
+_MOST_OF_OTHER = 0.1
 # Values pile up at a top if it has more than this share of the pixels, and less than that lies just
 # below, above this share of the top.
 _PILED_UP, _BELOW_TOP = 0.05, 0.98
@@ -294,7 +297,8 @@ def _plateau_variances(
         else:
             ink, of_ink = min(at_edges, seen), of_edges
     slope = (white - ink) / (of_white - of_ink)
-    return max(ink - slope * of_ink, floor), max(white + slope * (1.0 - of_white), floor)
+    least_ink = (1.0 - _MOST_OF_OTHER) * ink if is_ink_seen else floor
+    return max(ink - slope * of_ink, least_ink, floor), max(white + slope * (1.0 - of_white), floor)
 
 
 @compiled

@@ -106,10 +106,11 @@ def test_noise_follows_the_level() -> None:
 
 @pytest.mark.parametrize("from_edges", ["of both plateaus", "of ink and edges"])
 def test_noise_of_ink_is_that_of_no_share_of_plate(from_edges: str) -> None:
-    """Plateaus have a little of the other one in them, whose noise is six times as large."""
+    """Its pixels have 2 % of plate in them, whose variance is six times as large."""
     rng, found = np.random.default_rng(13), []
     for _ in range(60):
-        share = np.concatenate((0.12 * rng.random(900), 0.2 + 0.6 * rng.random(600), np.ones(600)))
+        of_ink = np.concatenate((np.zeros(650), 0.14 * rng.random(250)))
+        share = np.concatenate((of_ink, 0.2 + 0.6 * rng.random(600), np.ones(600)))
         variance = 0.004**2 + share * (0.010**2 - 0.004**2)
         usable = share < 1.0 if from_edges == "of ink and edges" else np.ones(len(share), bool)
         residuals = rng.normal(0.0, np.sqrt(variance))
