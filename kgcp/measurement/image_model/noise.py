@@ -139,6 +139,7 @@ def estimate_noise(
     *,
     in_bands: bool = False,
     from_edges: bool = False,
+    is_of_light: bool = True,
 ) -> GreyNoise:
     """Return the noise of every pixel from the residuals of a fit.
 
@@ -156,10 +157,13 @@ def estimate_noise(
         Whether noise is estimated in bands of the share, instead of along a line from ink to plate.
     from_edges : bool
         Whether the noise of ink, or of plate, is taken from edges where there is too little of it.
+    is_of_light : bool
+        Whether the variance is about linear in the share: then that of ink and of plate alone is
+        told from pixels that have a little of the other one in them.
     """
     sd, plateau_sd = np.empty_like(residuals), np.empty_like(residuals)
     floor = (_MIN_NOISE_COUNTS * levels_per_count) ** 2
-    _estimate(residuals, share, usable, floor, (in_bands, from_edges), sd, plateau_sd)
+    _estimate(residuals, share, usable, floor, (in_bands, from_edges, is_of_light), sd, plateau_sd)
     return GreyNoise(sd, plateau_sd)
 
 
@@ -169,12 +173,13 @@ def _estimate(
     share: FloatArray,
     usable: BoolArray,
     floor: float,
-    choices: tuple[bool, bool],
+    choices: tuple[bool, bool, bool],
     sd: FloatArray,
     plateau_sd: FloatArray,
 ) -> None:
-    in_bands, from_edges = choices
-    ink, white = _plateau_variances(residuals, share, usable, floor, from_edges)
+    in_bands, from_edges, is_of_light = choices
+    plateaus = _plateau_variances(residuals, share, usable, floor, from_edges, is_of_light)
+    ink, white = plateaus
     edge, of_edge = np.empty(len(share)), 0
     for i in range(len(share)):
         within = min(max(share[i], 0.0), 1.0)
@@ -272,13 +277,15 @@ def _plateau_variances(
     usable: BoolArray,
     floor: float,
     from_edges: bool,  # noqa: FBT001 - compiled functions have no keywords
+    is_of_light: bool,  # noqa: FBT001
 ) -> tuple[float, float]:
     """Return the variances of ink and plate.
 
     The pixels of a plateau have a little of the other one in them: of dark ink, whose noise is
-    small, that is 3 to 8 % of the variance. So the line through both is taken to the ends. If one
-    plateau is not seen, it is that of the other, or what edges tell; if neither is, both are that
-    of all pixels.
+    small, that is 3 to 8 % of the variance. So the line through both is taken to the ends. Of plain
+    discs under an unknown tone curve it is not: that curve was learnt less well. If one plateau is
+    not seen, it is that of the other, or what edges tell; if neither is, both are that of all
+    pixels.
     """
     ink, of_ink = _mean_variance(residuals, share, usable, -math.inf, 0.15)
     white, of_white = _mean_variance(residuals, share, usable, 0.85, math.inf)
@@ -296,6 +303,9 @@ def _plateau_variances(
             white, of_white = max(at_edges, seen), of_edges
         else:
             ink, of_ink = min(at_edges, seen), of_edges
+    if not is_of_light:
+        of_ink = 0.0 if is_ink_seen else of_ink
+        of_white = 1.0 if is_white_seen else of_white
     slope = (white - ink) / (of_white - of_ink)
     least_ink = (1.0 - _MOST_OF_OTHER) * ink if is_ink_seen else floor
     return max(ink - slope * of_ink, least_ink, floor), max(white + slope * (1.0 - of_white), floor)

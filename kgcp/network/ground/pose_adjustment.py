@@ -27,6 +27,9 @@ _ENDS_SD, _LEAST_RISE = 3.0, 0.5  # where a bend ends, and how much of χ² must
 _NO_DISTANCE = 1e6  # deviation of the logarithm of a distance that is not measured
 _DOUBTED_CHI2 = 9.0  # of a point that counts half for what all points have in common
 _COMMON_ROUNDS = 5  # of its reweighting
+_LEAST_MOTION_RAD_S = (
+    1e-6  # of the deviation of a motion: 0, as a file may state it, has no inverse
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,16 +43,6 @@ class _Linearised:
     by_point: FloatArray  # (n, 3, 3): … by the points' positions
     common: FloatArray  # (n, 3, k): … by what all points have in common
     precisions: FloatArray  # (k,): inverse a-priori variances of that
-
-    def chosen(self, which: BoolArray) -> _Linearised:
-        """Return some of the points."""
-        return replace(
-            self,
-            residuals=self.residuals[which],
-            design=self.design[which],
-            by_point=self.by_point[which],
-            common=self.common[which],
-        )
 
 
 def _linearised(camera: Camera, images: PointImages, pose: CameraPose) -> _Linearised:
@@ -68,7 +61,8 @@ def _linearised(camera: Camera, images: PointImages, pose: CameraPose) -> _Linea
         parts.append(by_motion)
         rotation = images.readout.rotation
         sight_m = np.linalg.norm(images.positions_m - pose.centre_m, axis=1)
-        sds += [rotation.sd_rad_s * float(sight_m.mean())] * 3 + [rotation.sd_rad_s] * 3
+        sd_rad_s = max(rotation.sd_rad_s, _LEAST_MOTION_RAD_S)
+        sds += [sd_rad_s * float(sight_m.mean())] * 3 + [sd_rad_s] * 3
         # where the scene turns one way, the camera turns the other way
         turn = -pose.world_from_camera @ np.array(rotation.velocity_rad_s)
         residuals = residuals - by_motion[:, :, 3:] @ turn
