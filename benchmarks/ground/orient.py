@@ -132,7 +132,7 @@ def _seen(
     sd_rad_s = math.radians(camera.motion_sd_deg_s)
     motion = rng.normal(0.0, np.repeat([sd_rad_s * _HEIGHT_M, sd_rad_s], 3))
     for _ in range(3):  # the row depends on the motion
-        delay_s = camera.readout_s * (camera.project(seen)[:, 1] / (camera.height - 1) - 0.5)
+        delay_s = camera.delay_s(camera.project(seen))
         seen = np.vstack(
             [
                 pose.moved(each_s * motion).in_camera(point[None])

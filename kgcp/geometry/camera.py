@@ -189,9 +189,13 @@ class Camera:
         """Geometric mean of the two principal distances [px]."""
         return math.sqrt(self.fx * self.fy)
 
+    def rows_since_middle(self, pixels: FloatArray) -> FloatArray:
+        """Return how far below the middle row pixels (n, 2) lie (n,), in frames: -0.5 … 0.5."""
+        return pixels[:, 1] / (self.height - 1) - 0.5
+
     def delay_s(self, pixels: FloatArray) -> FloatArray:
         """Return how much later than the middle row pixels (n, 2) are exposed (n,) [s]."""
-        return self.readout_s * (pixels[:, 1] / (self.height - 1) - 0.5)
+        return self.readout_s * self.rows_since_middle(pixels)
 
     def project(self, points_camera: FloatArray) -> FloatArray:
         """Project points (n, 3) in the camera frame [m] to raw pixels (n, 2)."""

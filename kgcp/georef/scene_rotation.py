@@ -39,10 +39,10 @@ class CameraMotions:
 
 def combine(observed_rad_s: FloatArray, sd_rad_s: float, a_priori: SceneRotation) -> SceneRotation:
     """Return the weighted mean of an observed rotation (3,) and of one that is known before."""
-    weight = a_priori.sd_rad_s**2 / (a_priori.sd_rad_s**2 + sd_rad_s**2)
-    mean = weight * observed_rad_s + (1.0 - weight) * np.array(a_priori.velocity_rad_s)
+    before = np.array(a_priori.velocity_rad_s)
+    mean, sd = _weighted(observed_rad_s, sd_rad_s, before, a_priori.sd_rad_s)
     x, y, z = mean.tolist()
-    return SceneRotation((x, y, z), math.sqrt(weight) * sd_rad_s)
+    return SceneRotation((x, y, z), sd)
 
 
 def rotations_between_frames(
@@ -72,8 +72,13 @@ def rotations_between_frames(
     """
     near, is_near = _differences(time_s, sight_m, camera_from_plate, 1)
     wide, is_wide = _differences(time_s, sight_m, camera_from_plate, 2)
-    before = [a_priori] * len(time_s)
-    return _believed(time_s, near, is_near, wide, is_wide, before, _UNSEEN_SHARE)
+    before = np.tile(a_priori.velocity_rad_s, (len(time_s), 1))
+    sd_before = np.full(len(time_s), a_priori.sd_rad_s)
+    rates, sds = _believed(time_s, near, is_near, wide, is_wide, before, sd_before, _UNSEEN_SHARE)
+    return [
+        SceneRotation((x, y, z), sd)
+        for (x, y, z), sd in zip(rates.tolist(), sds.tolist(), strict=True)
+    ]
 
 
 def camera_motions(
@@ -107,17 +112,20 @@ def camera_motions(
     at_s, centres, axes = time_s[rows], centre_m[rows], enu_from_camera[rows]
     near, is_near = _shifts_and_turns(at_s, centres, axes, 1)
     wide, is_wide = _shifts_and_turns(at_s, centres, axes, 2)
-    before = [SceneRotation(tuple(turn[row].tolist()), float(sds[row])) for row in rows]
-    turned = _believed(at_s, near[:, 3:], is_near, wide[:, 3:], is_wide, before, _UNSEEN_SHARE)
-    # as angles at the distance, shifts are of the same kind
-    still = [SceneRotation((0.0, 0.0, 0.0), float(sds[row])) for row in rows]
-    near, wide = near[:, :3] / distance_m, wide[:, :3] / distance_m
-    shifted = _believed(at_s, near, is_near, wide, is_wide, still, _UNSEEN_SHARE_OF_SHIFTS)
-    for row, turned_one, shifted_one in zip(rows, turned, shifted, strict=True):
-        turn[row], sd_turn[row] = turned_one.velocity_rad_s, turned_one.sd_rad_s
-        velocity[row] = np.multiply(distance_m, shifted_one.velocity_rad_s)
-        sd_velocity[row] = distance_m * shifted_one.sd_rad_s
-        is_seen[row] = shifted_one.sd_rad_s < sds[row]
+    turn[rows], sd_turn[rows] = _believed(
+        at_s, near[:, 3:], is_near, wide[:, 3:], is_wide, turn[rows], sds[rows], _UNSEEN_SHARE
+    )
+    velocity[rows], sd_velocity[rows] = _believed(
+        at_s,
+        near[:, :3],
+        is_near,
+        wide[:, :3],
+        is_wide,
+        velocity[rows],
+        sd_velocity[rows],
+        _UNSEEN_SHARE_OF_SHIFTS,
+    )
+    is_seen[rows] = sd_velocity[rows] < sds[rows] * distance_m
     return CameraMotions(velocity, sd_velocity, turn, sd_turn, is_seen)
 
 
@@ -127,27 +135,36 @@ def _believed(
     is_near: BoolArray,
     wide: FloatArray,
     is_wide: BoolArray,
-    a_priori: Sequence[SceneRotation],
+    before: FloatArray,
+    sd_before: FloatArray,
     unseen_share: float,
-) -> list[SceneRotation]:
-    """Return rates by differences (n, 3) over near neighbours, as good as wide ones agree."""
+) -> tuple[FloatArray, FloatArray]:
+    """Return rates (n, 3) and their deviations (n,), with what was known of them before.
+
+    Differences over near neighbours are as good as those over wide ones agree with them.
+    """
+    rates, sds = before.copy(), sd_before.copy()
     compared = np.flatnonzero(is_near & is_wide)
     if len(compared) < _FEWEST:
-        return [*a_priori]
+        return rates, sds
     off2 = np.mean((near - wide)[compared] ** 2, axis=1)
-    rotations = []
-    for row, before in enumerate(a_priori):
-        if not is_near[row]:
-            rotations.append(before)
-            continue
+    for row in np.flatnonzero(is_near):
         # times ascend: the nearest frames are among as many on either side
         place = int(np.searchsorted(compared, row))
         around = np.arange(max(place - _NEAREST, 0), min(place + _NEAREST, len(compared)))
         order = np.argsort(np.abs(time_s[compared[around]] - time_s[row]), kind="stable")
         nearest = around[order[:_NEAREST]]
-        sd = math.hypot(math.sqrt(float(off2[nearest].mean())), unseen_share * before.sd_rad_s)
-        rotations.append(combine(near[row], sd, before))
-    return rotations
+        sd = math.hypot(math.sqrt(float(off2[nearest].mean())), unseen_share * sd_before[row])
+        rates[row], sds[row] = _weighted(near[row], sd, before[row], float(sd_before[row]))
+    return rates, sds
+
+
+def _weighted(
+    observed: FloatArray, sd: float, before: FloatArray, sd_before: float
+) -> tuple[FloatArray, float]:
+    """Return the weighted mean of two rates (3,), and its deviation."""
+    weight = sd_before**2 / (sd_before**2 + sd**2)
+    return weight * observed + (1.0 - weight) * before, math.sqrt(weight) * sd
 
 
 def _shifts_and_turns(

@@ -52,11 +52,11 @@ class Sighting:
         """
         if self.time_s is None:
             return None
-        return self.time_s + float(camera.delay_s(self.centre_px[None])[0])
+        return self.time_s + self.rows_since_middle(camera) * camera.readout_s
 
     def rows_since_middle(self, camera: Camera) -> float:
         """Return how far below the middle row the centre lies, in frames: -0.5 … 0.5 inside."""
-        return float(self.centre_px[1]) / (camera.height - 1) - 0.5
+        return float(camera.rows_since_middle(self.centre_px[None])[0])
 
 
 def sighting_of(frame: str, number: int, time_s: float | None, seen: Measurement) -> Sighting:

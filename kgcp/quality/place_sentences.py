@@ -7,7 +7,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from kgcp.geometry.camera import Camera
 from kgcp.georef.camera_priors import MIN_AMBIGUITY
+from kgcp.georef.scene_rotation import CameraMotions
 from kgcp.network.ground.target_places import PlacedTarget, Placement
 from kgcp.quality.number_text import minus
 
@@ -127,3 +129,14 @@ def noise_sentence(placement: Placement) -> str:
     if not parts:
         return ""
     return f"the images deviate by more than is stated: {' and '.join(parts)}; this is allowed for"
+
+
+def motion_sentence(motions: CameraMotions | None, camera: Camera) -> str:
+    """Return that nothing tells a rolling shutter's motion; empty: it is told, or there is none."""
+    if motions is None or motions.is_seen.any():
+        return ""
+    return (
+        "poses and times do not tell how the camera moves while its rolling shutter reads a"
+        f" frame: the standard deviations assume {camera.motion_sd_deg_s:g}°/s (motion_sd_deg_s);"
+        " give times to the frames"
+    )

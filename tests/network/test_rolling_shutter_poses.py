@@ -84,7 +84,7 @@ def sightings_of(
 
 
 def drawn_motion(rng: np.random.Generator) -> FloatArray:
-    """As fast as the camera's settings say: the line of sight turns by either half."""
+    """Shift and turn, each as fast as the camera's settings say of the line of sight."""
     sds = np.repeat([29.0 * SD_RAD_S, SD_RAD_S], 3)
     return np.asarray(sds * rng.standard_normal(6))
 

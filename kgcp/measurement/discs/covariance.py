@@ -96,7 +96,8 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
     common[:2, :2] += bent_px @ bent_px
     to_moments = moments_by_stretch(fit.state.geometry)
     # errors over deviations of a noise that is estimated are distributed as Student's t
-    of_noise = fit.noise_freedom / (fit.noise_freedom - 2.0)
+    freedom = fit.noise_freedom
+    of_noise = freedom / (freedom - 2.0)
     return DiscScatter(
         of_noise * (to_moments @ own[:, :GEOMETRY_COUNT] @ to_moments.T),
         to_moments @ common @ to_moments.T,

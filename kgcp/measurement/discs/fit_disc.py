@@ -522,7 +522,7 @@ def _noise(
             usable,
             step / slope.max(),
             from_edges=True,
-            is_of_light=not sample.level_model.tone.is_shaped,
+            is_linear_in_share=not sample.level_model.tone.is_shaped,
         )
         noise = GreyNoise(of_light.sd * slope, of_light.plateau_sd * slope)
         if is_seen.all():

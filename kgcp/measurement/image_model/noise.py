@@ -28,7 +28,7 @@ _TRIMMED_VARIANCE = 0.6230  # of a unit normal variable within its central 90 %
 _MIN_SAMPLES = 8
 # Of the variance of ink, that plate may have in it. What jagged edges scatter is not that: without
 # a limit, the noise of ink was taken for none, and a tone curve did not settle.
-_MOST_OF_OTHER = 0.1
+_MOST_OF_PLATE = 0.1
 # Values pile up at a top if it has more than this share of the pixels, and less than that lies just
 # below, above this share of the top.
 _PILED_UP, _BELOW_TOP = 0.05, 0.98
@@ -139,7 +139,7 @@ def estimate_noise(
     *,
     in_bands: bool = False,
     from_edges: bool = False,
-    is_of_light: bool = True,
+    is_linear_in_share: bool = True,
 ) -> GreyNoise:
     """Return the noise of every pixel from the residuals of a fit.
 
@@ -157,13 +157,15 @@ def estimate_noise(
         Whether noise is estimated in bands of the share, instead of along a line from ink to plate.
     from_edges : bool
         Whether the noise of ink, or of plate, is taken from edges where there is too little of it.
-    is_of_light : bool
+    is_linear_in_share : bool
         Whether the variance is about linear in the share: then that of ink and of plate alone is
         told from pixels that have a little of the other one in them.
     """
     sd, plateau_sd = np.empty_like(residuals), np.empty_like(residuals)
     floor = (_MIN_NOISE_COUNTS * levels_per_count) ** 2
-    _estimate(residuals, share, usable, floor, (in_bands, from_edges, is_of_light), sd, plateau_sd)
+    _estimate(
+        residuals, share, usable, floor, (in_bands, from_edges, is_linear_in_share), sd, plateau_sd
+    )
     return GreyNoise(sd, plateau_sd)
 
 
@@ -177,9 +179,8 @@ def _estimate(
     sd: FloatArray,
     plateau_sd: FloatArray,
 ) -> None:
-    in_bands, from_edges, is_of_light = choices
-    plateaus = _plateau_variances(residuals, share, usable, floor, from_edges, is_of_light)
-    ink, white = plateaus
+    in_bands, from_edges, is_linear_in_share = choices
+    ink, white = _plateau_variances(residuals, share, usable, floor, from_edges, is_linear_in_share)
     edge, of_edge = np.empty(len(share)), 0
     for i in range(len(share)):
         within = min(max(share[i], 0.0), 1.0)
@@ -277,7 +278,7 @@ def _plateau_variances(
     usable: BoolArray,
     floor: float,
     from_edges: bool,  # noqa: FBT001 - compiled functions have no keywords
-    is_of_light: bool,  # noqa: FBT001
+    is_linear_in_share: bool,  # noqa: FBT001
 ) -> tuple[float, float]:
     """Return the variances of ink and plate.
 
@@ -303,11 +304,11 @@ def _plateau_variances(
             white, of_white = max(at_edges, seen), of_edges
         else:
             ink, of_ink = min(at_edges, seen), of_edges
-    if not is_of_light:
+    if not is_linear_in_share:
         of_ink = 0.0 if is_ink_seen else of_ink
         of_white = 1.0 if is_white_seen else of_white
     slope = (white - ink) / (of_white - of_ink)
-    least_ink = (1.0 - _MOST_OF_OTHER) * ink if is_ink_seen else floor
+    least_ink = (1.0 - _MOST_OF_PLATE) * ink if is_ink_seen else floor
     return max(ink - slope * of_ink, least_ink, floor), max(white + slope * (1.0 - of_white), floor)
 
 

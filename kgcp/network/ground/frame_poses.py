@@ -61,8 +61,6 @@ class FramePose:
         In the local ENU frame; None: not oriented.
     cov : (6, 6) array or None
         Position [m] and left rotation vector [rad], ENU axes.
-    by_positions : (6, m, 3) array or None
-        How the pose follows the positions of the m used targets; None: not by three targets.
     used : tuple of str
         Targets that agree with it.
     reason : str
@@ -84,6 +82,8 @@ class FramePose:
         Logarithm of what all distances are too long by, alike; None: as `residuals`.
     sd_distance_scale : float or None
         Its standard deviation.
+    by_positions : (6, m, 3) array or None
+        Derivatives of the pose by the positions of the m used targets; None: as `residuals`.
     """
 
     frame: str
@@ -373,7 +373,7 @@ def _attitude_sample(
     world_from_camera = frame.pose.world_from_camera
     slopes = np.swapaxes(frame.by_positions[3:], 0, 1)
     by_positions = dict(zip(frame.used, slopes, strict=True))
-    cov = frame.cov[3:, 3:] - _by_positions(by_positions, position_covs)
+    cov = frame.cov[3:, 3:] - _turn_cov(by_positions, position_covs)
     cov = cov + world_from_camera @ ring.pose_cov[3:, 3:] @ world_from_camera.T
     readout = Readout.of(camera, ring.centre_px[None], rotation)
     if readout is not None:
@@ -383,7 +383,7 @@ def _attitude_sample(
     return _AttitudeSample(world_from_camera @ ring.pose.rotation, cov, by_positions)
 
 
-def _by_positions(
+def _turn_cov(
     slopes: Mapping[str, FloatArray], position_covs: Mapping[str, FloatArray | None]
 ) -> FloatArray:
     """Return the covariance (3, 3) of a turn by its slopes and what positions are off by."""
@@ -416,7 +416,7 @@ def _mean_attitude(
     for sample, is_kept in zip(samples, kept, strict=True):
         for name, slope in sample.by_positions.items():
             slopes[name] += is_kept * slope / len(off)
-    common_cov = _by_positions(slopes, position_covs)
+    common_cov = _turn_cov(slopes, position_covs)
     chi2 = float(np.sum(off * np.linalg.solve(covs, off[..., None])[..., 0]))
     factor = max(1.0, chi2 / (3.0 * max(1, len(off) - 1)))
     return PlateAttitude(middle, factor * covs.sum(axis=0) / len(off) ** 2 + common_cov)

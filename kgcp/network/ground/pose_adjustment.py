@@ -46,7 +46,7 @@ class _Linearised:
 
 
 def _linearised(camera: Camera, images: PointImages, pose: CameraPose) -> _Linearised:
-    """Return observations near a pose that has all points before it."""
+    """Return observations near a pose; points behind the camera have no residual."""
     residuals = _residuals(camera, images, pose)
     design, by_point = _design(camera, images, pose)
     parts, sds = [], []

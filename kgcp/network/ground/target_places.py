@@ -294,10 +294,12 @@ def _at_their_rows(
     delay_s = camera.delay_s(views.moments[:, :2])
     turns = delay_s[:, None] * motions.turn_rad_s[at]
     effects = np.zeros((len(at), 6, 6))
-    effects[:, :3, :3] = (delay_s * motions.sd_velocity_m_s[at])[:, None, None]
-    effects[:, 3:, 3:] = (delay_s * motions.sd_turn_rad_s[at])[:, None, None]
-    effects[:, :3, :3] *= views.world_from_camera
-    effects[:, 3:, 3:] *= views.world_from_camera
+    shift_sds_m, turn_sds = (
+        delay_s * motions.sd_velocity_m_s[at],
+        delay_s * motions.sd_turn_rad_s[at],
+    )
+    effects[:, :3, :3] = shift_sds_m[:, None, None] * views.world_from_camera
+    effects[:, 3:, 3:] = turn_sds[:, None, None] * views.world_from_camera
     cov = effects @ np.swapaxes(effects, 1, 2)
     is_common = ~motions.is_seen[at]
     return replace(

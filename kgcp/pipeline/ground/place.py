@@ -42,6 +42,7 @@ from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.place_sentences import (
     diameter_sentence,
     doubts_of,
+    motion_sentence,
     noise_sentence,
     position_sentence,
     step_sentence,
@@ -119,21 +120,9 @@ class FlightPlaces:
         of_all = (
             step_sentence(self.placement),
             noise_sentence(self.placement),
-            self._motion_sentence,
+            motion_sentence(self.motions, self.flight.camera),
         )
         return (*doubts, *(sentence for sentence in of_all if sentence))
-
-    @property
-    def _motion_sentence(self) -> str:
-        """What is not known of the camera's motion; empty: it is known, or does not matter."""
-        sd_deg_s = self.flight.camera.motion_sd_deg_s
-        if self.motions is None or self.motions.is_seen.any():
-            return ""
-        return (
-            "poses and times do not tell how the camera moves while its rolling shutter reads a"
-            f" frame: the standard deviations assume {sd_deg_s:g}°/s (motion_sd_deg_s); give times"
-            " to the frames"
-        )
 
     def gcps(self) -> tuple[Gcp, ...]:
         """Return a ground control point for every sighting that took part, at the placed target."""

@@ -98,6 +98,21 @@ def test_deviations_of_discs_of_which_little_is_seen_are_true() -> None:
     assert 0.87 < np.sqrt(np.mean(z)) < 1.08
 
 
+@pytest.mark.parametrize(("gain", "is_burnt"), [(1.0, False), (1.5 / 0.62, True)])
+def test_only_edges_tell_the_noise_of_a_burnt_disc(*, gain: float, is_burnt: bool) -> None:
+    camera, pose = Camera(40, 40, 2e5, 2e5, 19.5, 19.5), Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    scene = FieldScene((SimulatedDisc((1.5e-6, 1e-6, 0.0), 10.0 / 2e5),), 0.62, 0.1)
+    rng = np.random.default_rng(8)
+    photo = photograph(camera, pose, scene, Optics(0.6), Sensor(), rng, gain)
+    (outline,) = find_outlines(photo)
+    fit = adjust_disc(DiscTask(photo, outline, []), DiscUnknowns.of(Tone.LINEAR))
+    assert fit.sample.is_burnt is is_burnt
+    if is_burnt:
+        assert 8.0 <= fit.noise_freedom < 0.5 * fit.redundancy
+    else:
+        assert fit.noise_freedom == fit.redundancy
+
+
 def test_a_disc_of_which_too_little_is_seen_is_refused() -> None:
     camera, pose = Camera(40, 40, 2e5, 2e5, 19.5, 19.5), Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
     scene = FieldScene((SimulatedDisc((1.5e-6, 1e-6, 0.0), 6.0 / 2e5),), 0.62, 0.1)

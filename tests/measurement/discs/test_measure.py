@@ -379,7 +379,7 @@ def test_ink_has_a_gradient_of_its_own_under_an_edge_through_the_middle(
 ) -> None:
     photo, truth = under_shadows(0.45, 12.0, 0.0)
     rms_px, sd_px = rms_and_sd_px(photo, truth)
-    assert 0.35 * sd_px < rms_px < 1.6 * sd_px
+    assert 0.5 * sd_px < rms_px < 1.6 * sd_px
     curves_only = slice(2, None)
     monkeypatch.setattr(fit_disc, "_UNEVEN", fit_disc._UNEVEN[curves_only])
     monkeypatch.setattr(fit_disc, "_UNEVEN_PRECISIONS", fit_disc._UNEVEN_PRECISIONS[curves_only])
@@ -389,15 +389,15 @@ def test_ink_has_a_gradient_of_its_own_under_an_edge_through_the_middle(
 def test_light_beyond_the_second_order_counts_as_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     photo, truth = under_shadows(0.45, 20.0, 3.0)
     rms_px, sd_px = rms_and_sd_px(photo, truth)
-    assert 0.35 * sd_px < rms_px < 1.6 * sd_px
+    assert 0.5 * sd_px < rms_px < 1.6 * sd_px
     monkeypatch.setattr(covariance, "_bend_px", lambda _: np.zeros((2, 2)))
-    assert 1.1 < sd_px / rms_and_sd_px(photo, truth)[1] < 1.8
+    assert 1.1 < sd_px / rms_and_sd_px(photo, truth)[1] < 1.5
 
 
 def test_little_of_an_uneven_light_is_enough_to_be_estimated(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    photo, truth = under_shadows(0.2, 12.0, 0.0)
+    photo, truth = under_shadows(0.3, 12.0, 0.0)
     rms_px, sd_px = rms_and_sd_px(photo, truth)
     assert 0.5 * sd_px < rms_px < 1.6 * sd_px
     monkeypatch.setattr(adjust_disc, "_CURVED", 200.0)

@@ -117,6 +117,12 @@ def test_noise_of_ink_is_that_of_no_share_of_plate(from_edges: str) -> None:
         noise = estimate_noise(residuals, share, usable, COUNT / 10.0, from_edges=True)
         found.append((noise.plateau_sd[:900] ** 2 / variance[:900]).mean())
     assert float(np.mean(found)) == pytest.approx(1.0, abs=0.02)
+    # by a tone curve, nothing says how much of that is plate's
+    noise = estimate_noise(
+        residuals, share, usable, COUNT / 10.0, from_edges=True, is_linear_in_share=False
+    )
+    whole = estimate_noise(residuals, share, usable, COUNT / 10.0, from_edges=True)
+    assert 1.05 < (noise.plateau_sd[0] / whole.plateau_sd[0]) ** 2 < 1.12
 
 
 def test_bands_of_many_pixels_have_their_own_noise_and_others_follow_the_line() -> None:
