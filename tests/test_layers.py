@@ -47,7 +47,7 @@ LEVEL = {member: level for level, members in enumerate(LAYERS) for member in mem
 
 # What each member may import besides the standard library and kgcp.
 ARRAYS = frozenset({"numpy"})
-NUMERICS = ARRAYS | {"scipy", "numba"}
+NUMERICS = ARRAYS | {"scipy", "numba", "llvmlite"}  # the last one is numba's compiler
 IMAGES = NUMERICS | {"cv2"}
 LIBRARIES: dict[str, frozenset[str]] = {
     "errors": frozenset(),

@@ -22,6 +22,7 @@ from kgcp.errors import KgcpError
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
+_FOR_READING = 0, 3, 1  # LLVM's prefetch: to read, into the nearest cache, of data
 _SPARED_CALLS = 100_000  # by Python take as long as loading numba and its tables: 0.5 s
 
 
@@ -91,6 +92,36 @@ class _Spared(_Compilable):
         return super().__call__(*args)
 
 
+class _Hint(_Compilable):
+    """A function (array, index) that does nothing but ask the processor to load that entry."""
+
+    def dispatcher(self) -> Callable[..., Any]:
+        """Return the function itself, which numba now knows as the processor's instruction."""
+        if self._dispatcher is None:
+            from llvmlite import ir
+            from numba import types
+            from numba.extending import lower_builtin, type_callable
+
+            number, pointer = ir.IntType(32), ir.IntType(8).as_pointer()
+
+            # Values of numba's own kinds, for which it has no types.
+            def returned(_: Any) -> Any:  # noqa: ANN401
+                return lambda _array, _index: types.void
+
+            def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ANN401
+                data = context.make_array(signature.args[0])(context, builder, values[0]).data
+                place = builder.bitcast(builder.gep(data, [values[1]]), pointer)
+                kind = ir.FunctionType(ir.VoidType(), [pointer, number, number, number])
+                hint = builder.module.declare_intrinsic("llvm.prefetch", [pointer], kind)
+                builder.call(hint, [place, *map(number, _FOR_READING)])
+                return context.get_dummy_value()
+
+            type_callable(self._function)(returned)
+            lower_builtin(self._function, types.Array, types.Integer)(generate)
+            self._dispatcher = self._function
+        return self._dispatcher
+
+
 def compiled(function: _Function) -> _Function:
     """Compile a function of numbers and arrays; division by zero gives inf or NaN as in numpy."""
     return cast("_Function", _Compilable(function))
@@ -127,3 +158,11 @@ def fused(function: _Function) -> _Function:
     process has compiled itself and what it has found compiled.
     """
     return cast("_Function", _Compilable(function, forceinline=True, fastmath={"contract"}))
+
+
+@_Hint
+def prefetch(array: np.ndarray[Any, Any], index: int) -> None:
+    """Have the processor load an entry of a contiguous array into its cache, without waiting.
+
+    For loops over places whose distances it cannot foresee. The index need not be in the array.
+    """

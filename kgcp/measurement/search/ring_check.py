@@ -15,7 +15,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from kgcp.geometry._jit import compiled, inlined
+from kgcp.geometry._jit import compiled, inlined, prefetch
 from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 from kgcp.measurement.search.pyramid import Pyramid
 from kgcp.measurement.search.ring_filter import PEAK_RADIUS_PX
@@ -49,6 +49,8 @@ _PLATE_RANKS = 11, 14, 19
 
 _TRIALS = np.outer(_ROUGH, _FINE).ravel()
 _COARSER = np.array((2.0, 3.0))  # pixels of the filtered images, in pixels of the sampled ones
+
+_AHEAD = 6  # peaks whose pixels are loaded beforehand; from 4 to 24, times are the same
 
 _Addresses = npt.NDArray[np.uintp]  # (radii, circles, directions)
 
@@ -135,7 +137,8 @@ def _check_level(
 
     A pixel of `image` is `factor` pixels of the frame wide, one of the level `coarser` times that.
     Samples are read by their distance from the place in the flattened image; only next to the
-    border their addresses are worked out one by one.
+    border their addresses are worked out one by one. The image is too large for the cache: rows
+    around later peaks are loaded beforehand, which halves the time.
     """
     height, width = image.shape
     pixels, reach = image.reshape(-1), fine_offsets.max()
@@ -146,6 +149,12 @@ def _check_level(
     values = np.empty((3, _ALL), np.uint8)
     count = 0
     for i in range(len(peaks)):
+        if i + _AHEAD < len(peaks):
+            x = math.floor(coarser * (peaks[i + _AHEAD, 0] + 0.5))
+            y = math.floor(coarser * (peaks[i + _AHEAD, 1] + 0.5))
+            for row in range(y - reach, y + reach + 1):  # a line of the cache is wider than a peak
+                prefetch(pixels, row * width + x - reach)
+                prefetch(pixels, row * width + x + reach)
         x = math.floor(coarser * (peaks[i, 0] + 0.5))  # the pixel that holds the point
         y = math.floor(coarser * (peaks[i, 1] + 0.5))
         dark, bright = math.ceil(peaks[i, 2]), math.floor(peaks[i, 2])
