@@ -2,7 +2,8 @@
 
 As for coded targets (`adjustment.covariance`): scores are summed over arcs of the edge, and their
 scatter is held against what independent residuals of this very fit would leave. A disc has few
-arcs: only a whole photograph shows that variances are below those of independent pixels.
+arcs: only a whole photograph shows that variances are below those of independent pixels. That is
+where JPEG compressed it, block by block of 8 × 8 pixels: so scores are summed over these, too.
 """
 
 from __future__ import annotations
@@ -24,12 +25,14 @@ from kgcp.measurement.image_model.noise import median_at_edges
 
 _ARC_PX = 6.0
 _FEWEST_ARCS = 8
+_BLOCK_PX = 8  # of JPEG
 _ARCS_IN_COMMON = 40.0  # what all discs of a photograph scatter counts like so many arcs
 _LEAST_LEFT = 1.0  # of the scatter, after the fit
 _OUTLYING_RATIO = 3.0  # of the median; larger ratios are those of single discs
 _LEAST_FACTOR = 0.25  # of variances, as for coded targets
-# Variances of ratios that independent residuals show, by one arc and by one pixel of an edge
-_ARC_VARIANCE, _PIXEL_VARIANCE = 2.0, 2.5
+# Variances of ratios that independent residuals show, by one arc, by one block and by one pixel of
+# an edge
+_ARC_VARIANCE, _BLOCK_VARIANCE, _PIXEL_VARIANCE = 2.0, 1.5, 2.5
 # Of centre and edge, whatever the noise; 0.0005 px made deviations of simulated discs of R 60 px
 # up to 15 % too large.
 _FLOOR_PX = 0.0002
@@ -49,6 +52,15 @@ _TONED_RING_SHARE, _LEAST_GAP_PX, _LEAST_GAP = 0.01, 1.9, 3.0
 _TONED_FALL = 0.05
 
 
+@dataclass(frozen=True, slots=True)
+class BlockScatter:
+    """The scatter of one disc's scores over JPEG's blocks."""
+
+    square: float
+    expected: float  # of independent residuals, after the fit: little, if there are few blocks
+    count: float  # how many blocks of equal weight would tell as much
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscScatter:
     """What the residuals of one disc say of its covariance."""
@@ -57,6 +69,7 @@ class DiscScatter:
     common: FloatArray  # (5, 5): what an edge displaced as a whole adds, and the floor
     ratio: float  # mean ratio of the scatter of scores to that of independent residuals
     arcs: int  # that it was found from
+    over_blocks: BlockScatter
     is_noise_alone: bool  # nothing is clipped, and light is linear
 
     def cov(self, inflation: float) -> FloatArray:
@@ -73,14 +86,17 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
     own = inverse[:GEOMETRY_COUNT]
     root = np.linalg.cholesky(own[:, :GEOMETRY_COUNT])
     to_own = np.linalg.solve(root, own)  # in units of N⁻¹
-    sums, products, arcs = _over_arcs(
-        np.ascontiguousarray((to_own @ scaled).T),
-        np.ascontiguousarray(scaled.T),
-        fit.misfit.score,
-        fit.misfit.weight,
-        _arcs(fit),
-    )
+    of_own, of_all = np.ascontiguousarray((to_own @ scaled).T), np.ascontiguousarray(scaled.T)
+    score, weight = fit.misfit.score, fit.misfit.weight
+    sums, products, arcs = _over_arcs(of_own, of_all, score, weight, _arcs(fit))
     ratio = scatter_ratio(sums, products, to_own, inverse)
+    sums, products, _ = _over_arcs(of_own, of_all, score, weight, _blocks(fit))
+    shares = np.einsum("bkp,kp->b", products, to_own)
+    over_blocks = BlockScatter(
+        float(np.sum(sums * sums)),
+        _scatter_left(products, to_own, inverse),
+        float(shares.sum() ** 2 / np.sum(shares * shares)),
+    )
     if _edges_tell_displacement(fit):  # then `RingUnknowns` has what that does
         left_px = _TONED_RING_SHARE * fit.state.blur.mean_sd_px if fit.free.tone.is_shaped else 0.0
         common_px = max(_FLOOR_PX, left_px)
@@ -103,6 +119,7 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
         to_moments @ common @ to_moments.T,
         ratio,
         arcs,
+        over_blocks,
         not (fit.sample.is_burnt or fit.free.is_light_curved),
     )
 
@@ -123,9 +140,16 @@ def scatter_ratio(
     inverse : (p, p) array
         N⁻¹, of all arcs and the priors.
     """
-    # of an arc whose normal matrix is A, a fit to residuals as expected leaves A − A N⁻¹ A
-    left = np.sum(products.sum(axis=0) * to_own) - np.sum((products @ inverse) * products)
-    return float(np.sum(sums * sums)) / max(float(left), _LEAST_LEFT)
+    left = _scatter_left(products, to_own, inverse)
+    return float(np.sum(sums * sums)) / max(left, _LEAST_LEFT)
+
+
+def _scatter_left(products: FloatArray, to_own: FloatArray, inverse: FloatArray) -> float:
+    """Return the scatter of scores that a fit leaves of residuals as expected.
+
+    Of an arc whose normal matrix is A, it leaves A − A N⁻¹ A.
+    """
+    return float(np.sum(products.sum(axis=0) * to_own) - np.sum((products @ inverse) * products))
 
 
 def inflations(scatters: Sequence[DiscScatter]) -> FloatArray:
@@ -137,23 +161,47 @@ def inflations(scatters: Sequence[DiscScatter]) -> FloatArray:
 
     A factor is below 1 if the whole photograph shows that, beyond chance. Compression and a
     camera's denoising leave residuals that cancel each other over neighbouring pixels: by JPEG of
-    quality 92, the squared scatter of arcs is 0.6 to 0.75 of what independent residuals would
+    quality 92, the squared scatter of blocks is 0.5 to 0.75 of what independent residuals would
     leave, and squared errors are smaller in the same way. It does not hold for burnt discs, whose
     levels are known beforehand rather than by residuals, nor for discs at the edge of a shadow,
     whose residuals are not those of noise.
     """
     if not scatters:
         return np.empty(0)
+    is_noise_alone = np.array([each.is_noise_alone for each in scatters])
     ratios = np.array([each.ratio for each in scatters])
     arcs = np.array([each.arcs for each in scatters], dtype=np.float64)
-    in_common = float(np.mean(np.minimum(ratios, _OUTLYING_RATIO * np.median(ratios))))
+    ratios[is_noise_alone] *= _left_by_blocks([each for each in scatters if each.is_noise_alone])
+    in_common = _typical(ratios)
     of_chance = np.array(_ARC_VARIANCE / arcs.sum())
     shown = max(1.0 - float(beyond_chance(np.array(1.0 - in_common), of_chance)), _LEAST_FACTOR)
-    least = np.where([each.is_noise_alone for each in scatters], shown, 1.0)
+    least = np.where(is_noise_alone, shown, 1.0)
     weight = arcs + _ARCS_IN_COMMON
     pooled = (arcs * ratios + _ARCS_IN_COMMON * in_common) / weight
     shared = _ARCS_IN_COMMON * (2.0 * arcs + _ARCS_IN_COMMON) / arcs.sum()
     return least + beyond_chance(pooled - least, _ARC_VARIANCE * (arcs + shared) / weight**2)
+
+
+def _left_by_blocks(scatters: Sequence[DiscScatter]) -> float:
+    """Return the scatter over JPEG's blocks as a share of that over arcs; 1 if none was compressed.
+
+    Errors of compression cancel each other over a block, and less so over arcs of edges, which are
+    not along its borders.
+    """
+    if not scatters:
+        return 1.0
+    of_arcs = _typical(np.array([each.ratio for each in scatters]))
+    blocks = [each.over_blocks for each in scatters]
+    squares, expected = np.array([(each.square, each.expected) for each in blocks]).T
+    most = _OUTLYING_RATIO * np.median(squares) / np.median(expected) * expected
+    of_blocks = float(np.minimum(squares, most).sum() / expected.sum())
+    of_chance = np.array(_BLOCK_VARIANCE / sum(each.count for each in blocks))
+    return 1.0 - float(beyond_chance(np.array(1.0 - of_blocks / of_arcs), of_chance))
+
+
+def _typical(ratios: FloatArray) -> float:
+    """Return the mean of ratios (n,), of which single discs' may be far above."""
+    return float(np.mean(np.minimum(ratios, _OUTLYING_RATIO * np.median(ratios))))
 
 
 def beyond_chance(excess: FloatArray, variance: FloatArray) -> FloatArray:
@@ -228,6 +276,13 @@ def _arcs(fit: DiscFit) -> IndexArray:
     count = max(round(length_px / _ARC_PX), _FEWEST_ARCS)
     turn = np.arctan2(v, u) / (2.0 * np.pi) % 1.0
     return np.asarray(np.minimum((turn * count).astype(np.intp), count - 1))
+
+
+def _blocks(fit: DiscFit) -> IndexArray:
+    """Return the number (n,) of the block that every pixel is in, if the photograph is whole."""
+    columns, rows = fit.sample.pixels.places_px.astype(np.intp) // _BLOCK_PX
+    numbers = rows * (fit.sample.window.frame_px // _BLOCK_PX + 1) + columns
+    return np.unique(numbers, return_inverse=True)[1]
 
 
 @compiled

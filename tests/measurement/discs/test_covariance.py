@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,13 +13,14 @@ from kgcp.geometry.circle_image import circle_images
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.discs.adjust_disc import DiscTask, adjust_disc
 from kgcp.measurement.discs.covariance import (
+    BlockScatter,
     DiscScatter,
     beyond_chance,
     inflations,
     scatter_of,
 )
 from kgcp.measurement.discs.fit_disc import DiscUnknowns
-from kgcp.measurement.discs.measure import measure_disc
+from kgcp.measurement.discs.measure import measure_disc, measure_discs
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.discs.records import Disc, DiscMiss, DiscReason
 from kgcp.measurement.image_model.photometry import Tone
@@ -28,9 +30,14 @@ from kgcp.simulation.imaging import Optics, Sensor
 ARCS = 10
 
 
+def scatter(ratio: float, over_blocks: float = 1.0) -> DiscScatter:
+    """Return that of a disc whose scatter over blocks is so much of the one over arcs."""
+    blocks = BlockScatter(4.0 * ratio * over_blocks, 4.0, 0.5 * ARCS)
+    return DiscScatter(np.eye(5), np.zeros((5, 5)), ratio, ARCS, blocks, is_noise_alone=True)
+
+
 def alone(ratio: float) -> float:
-    scatter = DiscScatter(np.eye(5), np.zeros((5, 5)), ratio, ARCS, is_noise_alone=True)
-    return float(inflations([scatter])[0])
+    return float(inflations([scatter(ratio)])[0])
 
 
 def test_a_third_is_left_of_what_chance_makes_of_no_excess() -> None:
@@ -52,19 +59,14 @@ def test_one_disc_is_inflated_by_what_its_arcs_show_beyond_chance() -> None:
 
 def test_what_all_discs_of_a_photograph_show_is_no_chance() -> None:
     ratios = 1.4 * np.random.default_rng(5).chisquare(ARCS, 200) / ARCS
-    scatters = [
-        DiscScatter(np.eye(5), np.zeros((5, 5)), each, ARCS, is_noise_alone=True) for each in ratios
-    ]
-    assert 1.3 < np.mean(inflations(scatters)) < 1.42
+    assert 1.3 < np.mean(inflations([scatter(each) for each in ratios])) < 1.42
     assert inflations([]).shape == (0,)
 
 
 def test_a_whole_photograph_shows_that_noise_cancels() -> None:
     ratios = 0.6 * np.random.default_rng(7).chisquare(ARCS, 100) / ARCS
     ratios[:3] = 20.0  # clutter
-    scatters = [
-        DiscScatter(np.eye(5), np.zeros((5, 5)), each, ARCS, is_noise_alone=True) for each in ratios
-    ]
+    scatters = [scatter(each) for each in ratios]
     factors = inflations(scatters)
     assert 0.58 < np.median(factors) < 0.7
     assert np.all(factors[:3] > 3.0)
@@ -72,6 +74,48 @@ def test_a_whole_photograph_shows_that_noise_cancels() -> None:
     others = [replace(each, is_noise_alone=False) for each in scatters]
     assert np.all(inflations(others) >= 1.0)
     assert np.median(inflations(others)) == 1.0
+
+
+def test_what_cancels_over_blocks_counts_if_all_discs_show_it() -> None:
+    rng = np.random.default_rng(9)
+    ratios = 0.8 * rng.chisquare(ARCS, 100) / ARCS
+    over_arcs = inflations([scatter(each) for each in ratios])
+    over_blocks = inflations([scatter(each, 0.75) for each in ratios])
+    assert np.median(over_blocks / over_arcs) == pytest.approx(0.76, abs=0.02)
+    # more of it is no compression, and of two discs it is chance
+    assert np.array_equal(inflations([scatter(each, 1.3) for each in ratios]), over_arcs)
+    assert np.array_equal(
+        inflations([scatter(0.8, 0.75), scatter(0.9, 0.75)]),
+        inflations([scatter(0.8), scatter(0.9)]),
+    )
+
+
+def test_jpegs_blocks_show_how_much_of_its_errors_cancels() -> None:
+    camera, pose = Camera(328, 248, 2e5, 2e5, 163.5, 123.5), Pose(np.eye(3), np.array([0, 0, 1.0]))
+    lattice = 26.0 * np.array([(i, j) for i in range(-5, 6) for j in range(-4, 5)])
+    tilt, rng = (0.48, 0.36, 0.8), np.random.default_rng(10)
+    stated, aside, errors = [], [], []
+    for _ in range(4):
+        middles = (lattice + rng.uniform(-4.0, 4.0, lattice.shape)) / 2e5
+        discs = tuple(
+            SimulatedDisc((x, y, 0.0), 10.0 / 2e5, 0.0, tilt) for x, y in middles.tolist()
+        )
+        scene = FieldScene(discs, 0.62, 0.1)
+        photo = photograph(camera, pose, scene, Optics(0.6), Sensor(), rng)
+        _, coded = cv2.imencode(".jpg", photo, [cv2.IMWRITE_JPEG_QUALITY, 92])
+        photo = np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.uint8)
+        truth = circle_images(camera, field_circles(pose, discs)).moments
+        for image, sds in ((photo, stated), (photo[4:, 4:].copy(), aside)):
+            outcomes = measure_discs(image, find_outlines(image), response=Response.LINEAR)
+            found = [disc for disc in outcomes if isinstance(disc, Disc)]
+            sds += [np.sqrt(np.diag(disc.cov)[:2]) for disc in found]
+            if image is photo:
+                for disc in found:
+                    nearest = np.linalg.norm(truth[:, :2] - disc.centre_px, axis=1).argmin()
+                    errors.append(disc.centre_px - truth[nearest, :2])
+    assert len(errors) == 4 * 99
+    assert 0.88 < np.sqrt(np.mean(np.square(np.array(errors) / stated))) < 1.08
+    assert np.mean(aside) > 1.05 * np.mean(stated)  # blocks that begin elsewhere show less of it
 
 
 def test_deviations_of_discs_of_which_little_is_seen_are_true() -> None:
