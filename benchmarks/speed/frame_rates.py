@@ -13,6 +13,7 @@ import click
 
 from benchmarks.reliability.soak import samples, speed_between
 from benchmarks.reliability.torture import Life, detecting
+from benchmarks.speed.sources import with_larger_camera
 from kgcp.io.images.frames import list_frames
 from kgcp.pipeline.execution.resilient_map import usable_cores
 from kgcp.pipeline.simulate import write_simulated_flight
@@ -28,15 +29,9 @@ _JOBS = (1, 2)
 
 def make_flight(folder: Path, scale: float, frames: int) -> str:
     """Write a flight of a camera with more pixels, and name its size."""
-    settings = preset(_PRESET)
-    camera = settings.camera
-    larger = replace(
-        camera,
-        width=round(scale * camera.width),
-        height=round(scale * camera.height),
-        **{name: scale * getattr(camera, name) for name in ("fx", "fy", "cx", "cy")},
-    )
-    plan = plan_flight(replace(settings, camera=larger, frames=_RENDERED), 1)
+    settings = with_larger_camera(replace(preset(_PRESET), frames=_RENDERED), scale)
+    larger = settings.camera
+    plan = plan_flight(settings, 1)
     write_simulated_flight(plan, folder, jobs=usable_cores(), on_frame=lambda: None)
     names = list_frames(folder / "frames")
     for number in range(_RENDERED, frames):

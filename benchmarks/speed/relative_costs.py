@@ -25,7 +25,7 @@ def main(flights: Path | None, photos: Path | None, frames: int) -> None:
     use_one_thread_each()  # before any library of numbers is loaded
     from benchmarks.speed.costs import HEADER, Costs, cost_line, cv2_alone, print_costs
     from benchmarks.speed.runs import help_line, jobs_line, size_lines
-    from benchmarks.speed.sources import flights_of, photograph_of, photographs_of
+    from benchmarks.speed.sources import flights_of, large_flight, photograph_of, photographs_of
 
     cv2_alone()
     with tempfile.TemporaryDirectory(prefix="kgcp_speed_") as folder:
@@ -36,6 +36,7 @@ def main(flights: Path | None, photos: Path | None, frames: int) -> None:
         print(HEADER, flush=True)
         of_flights = tuple(print_costs(sources, frames))
         print(cost_line(Costs("flights together", "both", of_flights)), flush=True)
+        tuple(print_costs([large_flight(work)], frames))
         tuple(print_costs(photographs, frames))
         print(jobs_line(sources[0], work), flush=True)
         print(help_line(), flush=True)

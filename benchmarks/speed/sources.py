@@ -19,12 +19,13 @@ from kgcp.pipeline.measure import measure_frame
 from kgcp.pipeline.simulate import write_simulated_flight
 from kgcp.quality.learnt_imaging import base_if_distances_agree, clearly_agreed_base
 from kgcp.simulation.flight import plan_flight
-from kgcp.simulation.presets import preset
+from kgcp.simulation.presets import SimulationSettings, preset
 
 _PRESETS = ("clean", "consumer")
 _AS_IT_IS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 _DECIDING = 32  # frames that tell the base of a tone curve
 _FOCAL = 1.2  # of a photograph's width
+_LARGE = 2.5  # times as many pixels each way: 12 Mpx
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +71,27 @@ def flights_of(folder: Path | None, work: Path, count: int) -> list[Source]:
         write_simulated_flight(plan, work / name, jobs=usable_cores(), on_frame=lambda: None)
         sources.append(_source(name, work / name))
     return sources
+
+
+def large_flight(work: Path) -> Source:
+    """Simulate a flight of a camera of 12 Mpx in `work`, with as many frames as settle a base."""
+    name = f"{_PRESETS[-1]}, larger"
+    settings = with_larger_camera(replace(preset(_PRESETS[-1]), frames=_DECIDING), _LARGE)
+    plan = plan_flight(settings, 1)
+    write_simulated_flight(plan, work / name, jobs=usable_cores(), on_frame=lambda: None)
+    return _source(name, work / name)
+
+
+def with_larger_camera(settings: SimulationSettings, scale: float) -> SimulationSettings:
+    """Return the settings with so many times the pixels each way, in the same field of view."""
+    camera = settings.camera
+    larger = replace(
+        camera,
+        width=round(scale * camera.width),
+        height=round(scale * camera.height),
+        **{name: scale * getattr(camera, name) for name in ("fx", "fy", "cx", "cy")},
+    )
+    return replace(settings, camera=larger)
 
 
 def _source(name: str, folder: Path) -> Source:
