@@ -93,7 +93,10 @@ class _Spared(_Compilable):
 
 
 class _Hint(_Compilable):
-    """A function (array, index) that does nothing but ask the processor to load that entry."""
+    """A function (array, index) that does nothing but ask the processor to load that entry.
+
+    Compiled functions of any file may call it, since it changes no result.
+    """
 
     def dispatcher(self) -> Callable[..., Any]:
         """Return the function itself, which numba now knows as the processor's instruction."""

@@ -25,9 +25,9 @@ from kgcp.measurement.image_model.noise import median_at_edges
 
 _ARC_PX = 6.0
 _FEWEST_ARCS = 8
-_BLOCK_PX = 8  # of JPEG
+_BLOCK_PX, _FEWEST_BLOCKS = 8, 40.0  # of JPEG; in all discs of a photograph
 _ARCS_IN_COMMON = 40.0  # what all discs of a photograph scatter counts like so many arcs
-_LEAST_LEFT = 1.0  # of the scatter, after the fit
+_LEAST_LEFT, _NEARLY_NONE = 1.0, 1e-6  # of the scatter, after the fit
 _OUTLYING_RATIO = 3.0  # of the median; larger ratios are those of single discs
 _LEAST_FACTOR = 0.25  # of variances, as for coded targets
 # Variances of ratios that independent residuals show, by one arc, by one block and by one pixel of
@@ -56,8 +56,8 @@ _TONED_FALL = 0.05
 class BlockScatter:
     """The scatter of one disc's scores over JPEG's blocks."""
 
-    square: float
-    expected: float  # of independent residuals, after the fit: little, if there are few blocks
+    ratio: float  # mean ratio to that of independent residuals
+    left: float  # of that, after the fit: little, if there are few blocks
     count: float  # how many blocks of equal weight would tell as much
 
 
@@ -91,12 +91,10 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
     sums, products, arcs = _over_arcs(of_own, of_all, score, weight, _arcs(fit))
     ratio = scatter_ratio(sums, products, to_own, inverse)
     sums, products, _ = _over_arcs(of_own, of_all, score, weight, _blocks(fit))
+    left = max(_scatter_left(products, to_own, inverse), _NEARLY_NONE)
     shares = np.einsum("bkp,kp->b", products, to_own)
-    over_blocks = BlockScatter(
-        float(np.sum(sums * sums)),
-        _scatter_left(products, to_own, inverse),
-        float(shares.sum() ** 2 / np.sum(shares * shares)),
-    )
+    equal = float(shares.sum() ** 2 / np.sum(shares * shares))
+    over_blocks = BlockScatter(float(np.sum(sums * sums)) / left, left, equal)
     if _edges_tell_displacement(fit):  # then `RingUnknowns` has what that does
         left_px = _TONED_RING_SHARE * fit.state.blur.mean_sd_px if fit.free.tone.is_shaped else 0.0
         common_px = max(_FLOOR_PX, left_px)
@@ -186,22 +184,23 @@ def _left_by_blocks(scatters: Sequence[DiscScatter]) -> float:
     """Return the scatter over JPEG's blocks as a share of that over arcs; 1 if none was compressed.
 
     Errors of compression cancel each other over a block, and less so over arcs of edges, which are
-    not along its borders.
+    not along its borders. A few discs do not tell it.
     """
-    if not scatters:
-        return 1.0
-    of_arcs = _typical(np.array([each.ratio for each in scatters]))
     blocks = [each.over_blocks for each in scatters]
-    squares, expected = np.array([(each.square, each.expected) for each in blocks]).T
-    most = _OUTLYING_RATIO * np.median(squares) / np.median(expected) * expected
-    of_blocks = float(np.minimum(squares, most).sum() / expected.sum())
-    of_chance = np.array(_BLOCK_VARIANCE / sum(each.count for each in blocks))
-    return 1.0 - float(beyond_chance(np.array(1.0 - of_blocks / of_arcs), of_chance))
+    count = sum(each.count for each in blocks)
+    if count < _FEWEST_BLOCKS:
+        return 1.0
+    lefts = np.array([each.left for each in blocks])
+    over_blocks = _typical(np.array([each.ratio for each in blocks]), lefts)
+    over_arcs = _typical(np.array([each.ratio for each in scatters]))
+    of_chance = np.array(_BLOCK_VARIANCE / count)
+    return 1.0 - float(beyond_chance(np.array(1.0 - over_blocks / over_arcs), of_chance))
 
 
-def _typical(ratios: FloatArray) -> float:
+def _typical(ratios: FloatArray, weights: FloatArray | None = None) -> float:
     """Return the mean of ratios (n,), of which single discs' may be far above."""
-    return float(np.mean(np.minimum(ratios, _OUTLYING_RATIO * np.median(ratios))))
+    usual = np.minimum(ratios, _OUTLYING_RATIO * np.median(ratios))
+    return float(np.average(usual, weights=weights))
 
 
 def beyond_chance(excess: FloatArray, variance: FloatArray) -> FloatArray:

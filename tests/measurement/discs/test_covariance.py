@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.circle_image import circle_images
 from kgcp.geometry.pose import Pose
@@ -32,7 +33,7 @@ ARCS = 10
 
 def scatter(ratio: float, over_blocks: float = 1.0) -> DiscScatter:
     """Return that of a disc whose scatter over blocks is so much of the one over arcs."""
-    blocks = BlockScatter(4.0 * ratio * over_blocks, 4.0, 0.5 * ARCS)
+    blocks = BlockScatter(ratio * over_blocks, 4.0, 0.5 * ARCS)
     return DiscScatter(np.eye(5), np.zeros((5, 5)), ratio, ARCS, blocks, is_noise_alone=True)
 
 
@@ -94,7 +95,9 @@ def test_jpegs_blocks_show_how_much_of_its_errors_cancels() -> None:
     camera, pose = Camera(328, 248, 2e5, 2e5, 163.5, 123.5), Pose(np.eye(3), np.array([0, 0, 1.0]))
     lattice = 26.0 * np.array([(i, j) for i in range(-5, 6) for j in range(-4, 5)])
     tilt, rng = (0.48, 0.36, 0.8), np.random.default_rng(10)
-    stated, aside, errors = [], [], []
+    stated: list[FloatArray] = []
+    aside: list[FloatArray] = []
+    errors: list[FloatArray] = []
     for _ in range(4):
         middles = (lattice + rng.uniform(-4.0, 4.0, lattice.shape)) / 2e5
         discs = tuple(
