@@ -30,30 +30,30 @@ class LosingPool(WorkerPool):
             yield item, TaskFailure.CRASHED
 
 
-UNSETTLED = CameraTone(Tone.UNKNOWN, 1.0, is_settled=False)
+UNTOLD = CameraTone(Tone.UNKNOWN, 1.0, is_told=False)
 
 
 class TellingPool(WorkerPool):
-    """Returns a tone, whatever it is given: one that did not settle where jobs are many."""
+    """Returns a tone, whatever it is given: one that is hardly told where jobs are many."""
 
     def map(
         self, function: Callable[..., Any], items: Iterable[Any]
     ) -> Generator[tuple[Any, Any | TaskFailure]]:
         assert callable(function)
         for item in items:
-            yield item, UNSETTLED if self.jobs > 1 else replace(UNSETTLED, is_settled=True)
+            yield item, UNTOLD if self.jobs > 1 else replace(UNTOLD, is_told=True)
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_a_tone_that_did_not_settle_is_told(jobs: int) -> None:
+def test_a_tone_that_compression_hides_is_warned_of(jobs: int) -> None:
     pool = TellingPool(jobs, SerialExecutor(), (), Counter())
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         learned = _camera_of(pool, cast("PhotoTask", None), ())
     assert learned is not None
-    said = ["did not settle" in str(each.message) for each in caught]
+    said = ["hardly tell their tone curve" in str(each.message) for each in caught]
     assert said == [True] * (jobs - 1)
-    assert learned.is_settled is (jobs == 1)
+    assert learned.is_told is (jobs == 1)
 
 
 def test_a_tone_that_cannot_be_learned_together_is_told() -> None:

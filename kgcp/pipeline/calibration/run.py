@@ -206,10 +206,12 @@ def _camera_of(pool: WorkerPool, task: PhotoTask, photos: Sequence[Photo]) -> Ca
             stacklevel=2,
         )
         return None
-    if learned is not None and not learned.is_settled:
+    if learned is not None and not learned.is_told:
         warnings.warn(
-            "the photographs are compressed so much that their tone curve did not settle: sizes of"
-            " the discs are less certain than stated; take them with less compression, or as PNG",
+            "the photographs are compressed so much that they hardly tell their tone curve: sizes"
+            " of the discs, and places where the light falls off steeply, are less certain than"
+            " stated; take them with less compression, or as PNG; if they are linear or sRGB, give"
+            " --response",
             KgcpWarning,
             stacklevel=2,
         )

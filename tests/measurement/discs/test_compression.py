@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 import pytest
@@ -180,12 +182,22 @@ def test_a_coefficient_tells_no_more_than_its_interval() -> None:
     assert abs(outlying.score[0]) == pytest.approx(3.5**2 / 160.0, rel=0.02)
 
 
-def test_rounds_that_do_not_settle_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    photos = [compressed(photo, 92) for photo in small_discs(FILM, 0, 1)]
-    tasks = [[DiscTask(photo, each, []) for each in find_outlines(photo)] for photo in photos]
-    assert learn_tone(tasks, Response.UNKNOWN).is_settled
+def tasks_of(photos: Sequence[GreyArray]) -> list[list[DiscTask]]:
+    return [[DiscTask(photo, each, []) for each in find_outlines(photo)] for photo in photos]
+
+
+def test_a_curve_is_not_told_if_rounds_do_not_settle(monkeypatch: pytest.MonkeyPatch) -> None:
+    tasks = tasks_of([compressed(photo, 92) for photo in small_discs(FILM, 0, 1)])
+    assert learn_tone(tasks, Response.UNKNOWN).is_told
     monkeypatch.setattr(joint_tone, "_COMPRESSION_ROUNDS", 1)
-    assert not learn_tone(tasks, Response.UNKNOWN).is_settled
+    assert not learn_tone(tasks, Response.UNKNOWN).is_told
+
+
+@pytest.mark.parametrize("sensor", [FILM, Sensor()])
+def test_a_curve_is_not_told_by_photographs_that_are_compressed_too_much(sensor: Sensor) -> None:
+    tasks = tasks_of([compressed(photo, 75) for photo in small_discs(sensor, 0, 1)])
+    assert not learn_tone(tasks, Response.UNKNOWN).is_told
+    assert learn_tone(tasks, Response.SRGB).is_told  # nothing to be told
 
 
 def test_steps_beyond_a_limit_of_the_curve_gain_most_along_it() -> None:
