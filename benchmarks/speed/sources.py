@@ -74,7 +74,7 @@ def flights_of(folder: Path | None, work: Path, count: int) -> list[Source]:
 
 
 def large_flight(work: Path) -> Source:
-    """Simulate a flight of a camera of 12 Mpx in `work`, with as many frames as settle a base."""
+    """Simulate a flight of 12 Mpx in `work`, with as many frames as tell its tone curve."""
     name = f"{_PRESETS[-1]}, larger"
     settings = with_larger_camera(replace(preset(_PRESETS[-1]), frames=_DECIDING), _LARGE)
     plan = plan_flight(settings, 1)

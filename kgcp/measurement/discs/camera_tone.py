@@ -113,7 +113,8 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     if best is None:
         return CameraTone(tone, SHARPENING_PX)
     base = _BENT.get(min(plain, key=lambda joint: joint.loss).tone) if plain else None
-    start, is_told = next((joint for joint in bent if joint.tone is base), None), True
+    start = next((joint for joint in bent if joint.tone is base), None)
+    is_told = True
     if start is not None and len(fits) >= _FEWEST_DISCS:  # few tell too little of a curve
         steps = _steps_of(best.fits)
         best = _before_compression(best, start, steps)
