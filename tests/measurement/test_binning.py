@@ -90,7 +90,7 @@ def standardised(shot: Shot) -> FloatArray:
     off_px = found.centre_px - shot.camera.project(shot.pose.translation_m[None])[0]
     sd_px = np.sqrt(np.diag(found.uncertainty.centre_cov_px2))
     assert abs(off_m) < 5e-5 * shot.pose.distance_m
-    assert found.appearance.blur_px == pytest.approx(math.hypot(shot.psf_px, 12**-0.5), rel=0.25)
+    assert found.appearance.blur_px == pytest.approx(math.hypot(shot.psf_px, 12**-0.5), rel=0.3)
     return np.append(off_px / sd_px, off_m / found.uncertainty.sd_distance_m)
 
 
@@ -102,6 +102,23 @@ def test_errors_of_large_rings_are_those_that_are_reported(response: Response, g
     rng = np.random.default_rng(5)
     errors = np.array([standardised(shoot(response, gain, rng)) for _ in range(6)])
     assert 0.4 < np.sqrt(np.mean(errors**2)) < 1.6  # 18 values
+
+
+def test_a_large_ring_half_in_shade_is_measured_by_single_pixels() -> None:
+    """In bins, distances were off by up to 0.03 %."""
+    rng = np.random.default_rng(11)
+    for turn in (0.4, 2.1, 3.9):
+        shot = shoot(Response.LINEAR, 0.9, rng)
+        columns, rows = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
+        across_px = (columns - 376.0) * math.cos(turn) + (rows - 304.0) * math.sin(turn)
+        lit = irradiance(shot.camera, shot.pose, math.hypot(shot.psf_px, 12**-0.5))
+        shaded = lit * (1.0 - 0.55 * ndtr((across_px - 20.0) / 6.0))
+        found = replace(shot, grey=SENSORS[Response.LINEAR].expose(shaded, 0.9, rng)).measured()
+        assert found.uncertainty is not None
+        off = found.pose.distance_m / shot.pose.distance_m - 1.0
+        sd = found.uncertainty.sd_distance_m / shot.pose.distance_m
+        assert sd < 3e-5
+        assert abs(off) < 3.5 * sd
 
 
 @pytest.mark.parametrize("count", [2, 3, 7])

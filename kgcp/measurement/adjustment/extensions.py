@@ -29,7 +29,12 @@ from kgcp.measurement.adjustment.plateaus import (
     step_across,
 )
 from kgcp.measurement.adjustment.problem import SMALL_RING_PX, FitProblem
-from kgcp.measurement.adjustment.random_levels import even_field, fit_levels, needs_varying_levels
+from kgcp.measurement.adjustment.random_levels import (
+    even_field,
+    fit_levels,
+    is_beyond_bins,
+    needs_varying_levels,
+)
 from kgcp.measurement.adjustment.skewed import needs_skew, with_skew
 from kgcp.measurement.adjustment.solver import TargetFit, adjust
 from kgcp.measurement.adjustment.two_poses import TwoPoses, fit_at, fit_both_poses
@@ -49,6 +54,10 @@ _OFF_MINIMUM_INFLATION = 3.0
 # levels explained better, four gained 9 to 19, and their errors grew from 0.04 to 0.06 %. Of 200
 # fits in uneven light, six gained less than 25; none was more than 2.3 σ off in even light.
 _LEAST_ADVANTAGE_IN_SMALL_RING = 25.0
+
+
+class UnevenLightInBins(Exception):  # noqa: N818 - the outcome of one fit
+    """The light is too uneven for bins: smaller ones are to be adjusted, or single pixels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,6 +88,7 @@ def fit_in_any_light(
     ------
     Rejection
         As `_fit_in_any_light`, if the fits over both fail.
+    UnevenLightInBins
     """
     # the same whatever the tone
     find_plateaus = cache(partial(look_at_plateaus, problem, pose, blur.mean_sd_px))
@@ -141,6 +151,7 @@ def _fit_in_any_light(
         As `kgcp.measurement.adjustment.two_poses.fit_both_poses`; `OTHER_CODE` if the code is not
         seen where the levels are even; `POOR_FIT` if varying levels do not explain the image
         either.
+    UnevenLightInBins
     """
     try:
         plain = _with_skew(problem, fit_both_poses(problem, pose, blur))
@@ -148,9 +159,13 @@ def _fit_in_any_light(
         plateaus = find_plateaus()
         if plateaus is None or not plateaus.is_uneven:
             raise
+        if problem.can_be_finer:
+            raise UnevenLightInBins from None
         return _in_seen_light(problem, pose, blur, plateaus)
     if not needs_varying_levels(plain.best):
         return plain
+    if is_beyond_bins(plain.best):
+        raise UnevenLightInBins
     plateaus = find_plateaus()
     if plateaus is None or not plateaus.is_uneven:
         varying = _with_levels(problem, plain)

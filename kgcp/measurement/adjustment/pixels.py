@@ -102,12 +102,14 @@ def select_pixels(
         sectors = _sectors_about_normal(seen.unblurred.points_m, len(problem.visible))
         unused |= ~problem.visible[sectors]
     index = _useful_pixels(seen, unused, near_sigmas, plateau_pixels)
-    is_thinned = max_pixels is not None and len(index) > max_pixels
-    if max_pixels is not None and is_thinned:
-        index = index[_GOLDEN * np.arange(len(index)) % 1.0 < max_pixels / len(index)]
+    most = problem.most_pixels if max_pixels is None else max_pixels
+    is_sparse = most is not None and len(index) > most
+    if most is not None and is_sparse:
+        index = index[_GOLDEN * np.arange(len(index)) % 1.0 < most / len(index)]
     if len(index) < 4 * PLAIN_COUNT:
         raise Rejection(Reason.EDGES_LOST, f"{len(index)} pixels of the target")
-    return _sample(seen, pose, light, index, is_thinned=is_thinned)
+    is_thinned = is_sparse and max_pixels is not None
+    return _sample(seen, pose, light, index, is_thinned=is_thinned, is_sparse=is_sparse)
 
 
 def whole_plate(problem: FitProblem, pose: Pose, blur: Blur, light: Light) -> Sample:
@@ -120,12 +122,19 @@ def whole_plate(problem: FitProblem, pose: Pose, blur: Blur, light: Light) -> Sa
     reach_m = (1.0 + _BORDER_RADII) * problem.outer_radius_m
     unused = background_mask(seen, light, slack_px=math.inf)
     index = np.flatnonzero((seen.unblurred.rho_m < reach_m) & ~unused)
-    return _sample(seen, pose, light, index, is_thinned=False)
+    return _sample(seen, pose, light, index, is_thinned=False, is_sparse=False)
 
 
 def _sample(
-    seen: SeenPlate, pose: Pose, light: Light | None, index: IndexArray, *, is_thinned: bool
+    seen: SeenPlate,
+    pose: Pose,
+    light: Light | None,
+    index: IndexArray,
+    *,
+    is_thinned: bool,
+    is_sparse: bool,
 ) -> Sample:
+    """Collect pixels; `is_sparse` says that some beside edges are not among them."""
     problem = seen.problem
     window, clip = problem.window, problem.censoring
     rays, pixels = np.take(window.rays, index, axis=1), window.pixels(index)
@@ -136,7 +145,7 @@ def _sample(
         is_thinned=is_thinned,
         levels=window.levels[index],
         rays=rays,
-        photometry=_photometric_model(seen, pose, light, index, pixels),
+        photometry=_photometric_model(seen, pose, light, index, pixels, is_sparse=is_sparse),
         censoring=Censoring(clip.high, clip.low, clip.at_high[index], clip.at_low[index]),
         incidence=_edge_incidence(seen, pose, rays, index),
     )
@@ -214,14 +223,21 @@ def _fill_in_pixels(
 
 
 def _photometric_model(
-    seen: SeenPlate, pose: Pose, light: Light | None, index: IndexArray, pixels: FloatArray
+    seen: SeenPlate,
+    pose: Pose,
+    light: Light | None,
+    index: IndexArray,
+    pixels: FloatArray,
+    *,
+    is_sparse: bool,
 ) -> PhotometricModel:
     problem, window = seen.problem, seen.problem.window
     offsets = (pixels - problem.centre_px[:, None]) / problem.outer_radius_px
     if problem.sharpening_px == 0.0 or light is None:
         return PhotometricModel(offsets, problem.tone, None)
-    is_small = problem.outer_radius_px < _SMALL_PX
-    shown = _white_share_shown(seen, pose, light, index) if is_small else seen.unblurred.share
+    shown = seen.unblurred.share
+    if is_sparse or problem.outer_radius_px < _SMALL_PX:
+        shown = _white_share_shown(seen, pose, light, index)
     mask = unsharp_mask((window.height, window.width), index, shown, problem.sharpening_px)
     return PhotometricModel(offsets, problem.tone, mask)
 

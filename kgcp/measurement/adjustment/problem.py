@@ -43,6 +43,12 @@ class FitProblem:
     # (m,): where the target is seen, in equal steps about its normal from its +x axis on; None:
     # everywhere, as far as the search knows
     visible: BoolArray | None = None
+    most_pixels: int | None = None  # that take part; None: all that are useful
+
+    @property
+    def can_be_finer(self) -> bool:
+        """Whether its pixels are bins, of which smaller ones were not tried."""
+        return self.window.binning > 1 and self.most_pixels is None
 
     @property
     def few_pixels(self) -> int | None:
