@@ -104,21 +104,34 @@ def test_errors_of_large_rings_are_those_that_are_reported(response: Response, g
     assert 0.4 < np.sqrt(np.mean(errors**2)) < 1.6  # 18 values
 
 
+def half_in_shade(turn: float, rng: np.random.Generator) -> Shot:
+    shot = shoot(Response.LINEAR, 0.9, rng)
+    columns, rows = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
+    across_px = (columns - 376.0) * math.cos(turn) + (rows - 304.0) * math.sin(turn)
+    lit = irradiance(shot.camera, shot.pose, math.hypot(shot.psf_px, 12**-0.5))
+    shaded = lit * (1.0 - 0.55 * ndtr((across_px - 20.0) / 6.0))
+    return replace(shot, grey=SENSORS[Response.LINEAR].expose(shaded, 0.9, rng))
+
+
 def test_a_large_ring_half_in_shade_is_measured_by_single_pixels() -> None:
     """In bins, distances were off by up to 0.03 %."""
     rng = np.random.default_rng(11)
     for turn in (0.4, 2.1, 3.9):
-        shot = shoot(Response.LINEAR, 0.9, rng)
-        columns, rows = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
-        across_px = (columns - 376.0) * math.cos(turn) + (rows - 304.0) * math.sin(turn)
-        lit = irradiance(shot.camera, shot.pose, math.hypot(shot.psf_px, 12**-0.5))
-        shaded = lit * (1.0 - 0.55 * ndtr((across_px - 20.0) / 6.0))
-        found = replace(shot, grey=SENSORS[Response.LINEAR].expose(shaded, 0.9, rng)).measured()
+        shot = half_in_shade(turn, rng)
+        found = shot.measured()
         assert found.uncertainty is not None
         off = found.pose.distance_m / shot.pose.distance_m - 1.0
         sd = found.uncertainty.sd_distance_m / shot.pose.distance_m
         assert sd < 3e-5
         assert abs(off) < 3.5 * sd
+
+
+def test_the_light_on_a_large_ring_half_in_shade_can_be_shown() -> None:
+    shot = half_in_shade(0.4, np.random.default_rng(11))
+    left = residual_image_of(shot.grey, shot.camera, TARGET_PLATE.target, shot.pose, shot.psf_px)
+    assert left.white is not None
+    assert 0.4 < np.nanquantile(left.white, 0.05) < 0.55  # 0.45 in the shade
+    assert np.nanmedian(np.abs(left.share)) < 0.02
 
 
 @pytest.mark.parametrize("count", [2, 3, 7])
