@@ -107,11 +107,12 @@ class _Hint(_Compilable):
 
             number, pointer = ir.IntType(32), ir.IntType(8).as_pointer()
 
-            # Values of numba's own kinds, for which it has no types.
+            # numba hands over objects of its own, for which it has no annotations
             def returned(_: Any) -> Any:  # noqa: ANN401
                 return lambda _array, _index: types.void
 
             def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ANN401
+                """Emit the instruction."""
                 data = context.make_array(signature.args[0])(context, builder, values[0]).data
                 place = builder.bitcast(builder.gep(data, [values[1]]), pointer)
                 kind = ir.FunctionType(ir.VoidType(), [pointer, number, number, number])

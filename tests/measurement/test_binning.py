@@ -90,6 +90,8 @@ def standardised(shot: Shot) -> FloatArray:
     off_px = found.centre_px - shot.camera.project(shot.pose.translation_m[None])[0]
     sd_px = np.sqrt(np.diag(found.uncertainty.centre_cov_px2))
     assert abs(off_m) < 5e-5 * shot.pose.distance_m
+    # one of film's curve is measured by single pixels, whose blur and sharpening make up for each
+    # other; of bins it is right to a quarter
     assert found.appearance.blur_px == pytest.approx(math.hypot(shot.psf_px, 12**-0.5), rel=0.3)
     return np.append(off_px / sd_px, off_m / found.uncertainty.sd_distance_m)
 
@@ -104,20 +106,23 @@ def test_errors_of_large_rings_are_those_that_are_reported(response: Response, g
     assert 0.4 < np.sqrt(np.mean(errors**2)) < 1.6  # 18 values
 
 
-def half_in_shade(turn: float, rng: np.random.Generator) -> Shot:
-    shot = shoot(Response.LINEAR, 0.9, rng)
+def half_in_shade(response: Response, turn: float, rng: np.random.Generator) -> Shot:
+    shot = shoot(response, 0.8, rng)
     columns, rows = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
     across_px = (columns - 376.0) * math.cos(turn) + (rows - 304.0) * math.sin(turn)
     lit = irradiance(shot.camera, shot.pose, math.hypot(shot.psf_px, 12**-0.5))
     shaded = lit * (1.0 - 0.55 * ndtr((across_px - 20.0) / 6.0))
-    return replace(shot, grey=SENSORS[Response.LINEAR].expose(shaded, 0.9, rng))
+    return replace(shot, grey=SENSORS[response].expose(shaded, 0.8, rng))
 
 
-def test_a_large_ring_half_in_shade_is_measured_by_single_pixels() -> None:
-    """In bins, distances were off by up to 0.03 %."""
+@pytest.mark.parametrize("response", [Response.LINEAR, Response.SRGB])
+def test_large_rings_half_in_shade_are_measured_as_well_as_in_even_light(
+    response: Response,
+) -> None:
+    """In linear light by bins; by bins of sRGB's curve deviations would be 0.013 to 0.019 %."""
     rng = np.random.default_rng(11)
     for turn in (0.4, 2.1, 3.9):
-        shot = half_in_shade(turn, rng)
+        shot = half_in_shade(response, turn, rng)
         found = shot.measured()
         assert found.uncertainty is not None
         off = found.pose.distance_m / shot.pose.distance_m - 1.0
@@ -126,11 +131,12 @@ def test_a_large_ring_half_in_shade_is_measured_by_single_pixels() -> None:
         assert abs(off) < 3.5 * sd
 
 
-def test_the_light_on_a_large_ring_half_in_shade_can_be_shown() -> None:
-    shot = half_in_shade(0.4, np.random.default_rng(11))
+@pytest.mark.parametrize("response", [Response.LINEAR, Response.SRGB])
+def test_the_light_on_a_large_ring_half_in_shade_can_be_shown(response: Response) -> None:
+    shot = half_in_shade(response, 0.4, np.random.default_rng(11))
     left = residual_image_of(shot.grey, shot.camera, TARGET_PLATE.target, shot.pose, shot.psf_px)
     assert left.white is not None
-    assert 0.4 < np.nanquantile(left.white, 0.05) < 0.55  # 0.45 in the shade
+    assert np.nanquantile(left.white, 0.05) == pytest.approx(0.45, abs=0.1)  # of the light
     assert np.nanmedian(np.abs(left.share)) < 0.02
 
 

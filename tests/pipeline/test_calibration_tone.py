@@ -30,18 +30,18 @@ class LosingPool(WorkerPool):
             yield item, TaskFailure.CRASHED
 
 
-UNTOLD = CameraTone(Tone.UNKNOWN, 1.0, is_told=False)
+UNRELIABLE = CameraTone(Tone.UNKNOWN, 1.0, is_reliable=False)
 
 
 class TellingPool(WorkerPool):
-    """Returns a tone, whatever it is given: one that is hardly told where jobs are many."""
+    """Returns a tone, whatever it is given: an unreliable one where jobs are many."""
 
     def map(
         self, function: Callable[..., Any], items: Iterable[Any]
     ) -> Generator[tuple[Any, Any | TaskFailure]]:
         assert callable(function)
         for item in items:
-            yield item, UNTOLD if self.jobs > 1 else replace(UNTOLD, is_told=True)
+            yield item, UNRELIABLE if self.jobs > 1 else replace(UNRELIABLE, is_reliable=True)
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -53,10 +53,10 @@ def test_a_tone_that_compression_hides_is_warned_of(jobs: int) -> None:
     assert learned is not None
     said = ["hardly tell their tone curve" in str(each.message) for each in caught]
     assert said == [True] * (jobs - 1)
-    assert learned.is_told is (jobs == 1)
+    assert learned.is_reliable is (jobs == 1)
 
 
-def test_a_tone_that_cannot_be_learned_together_is_told() -> None:
+def test_a_tone_that_cannot_be_learned_together_is_reliable() -> None:
     pool = LosingPool(1, SerialExecutor(), (), Counter())
     with pytest.warns(KgcpWarning, match="has ended or taken too long"):
         assert _camera_of(pool, cast("PhotoTask", None), ()) is None

@@ -89,6 +89,7 @@ def fit_in_any_light(
     Rejection
         As `_fit_in_any_light`, if the fits over both fail.
     UnevenLightInBins
+        Only if the problem `may_be_finer`.
     """
     # the same whatever the tone
     find_plateaus = cache(partial(look_at_plateaus, problem, pose, blur.mean_sd_px))
@@ -152,6 +153,7 @@ def _fit_in_any_light(
         seen where the levels are even; `POOR_FIT` if varying levels do not explain the image
         either.
     UnevenLightInBins
+        Only if the problem `may_be_finer`.
     """
     try:
         plain = _with_skew(problem, fit_both_poses(problem, pose, blur))
@@ -159,7 +161,7 @@ def _fit_in_any_light(
         plateaus = find_plateaus()
         if plateaus is None or not plateaus.is_uneven:
             raise
-        if problem.can_be_finer:
+        if problem.may_be_finer:
             raise UnevenLightInBins from None
         return _in_seen_light(problem, pose, blur, plateaus)
     if not needs_varying_levels(plain.best):

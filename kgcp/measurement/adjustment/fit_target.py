@@ -35,6 +35,7 @@ from kgcp.measurement.adjustment.two_poses import (
 )
 from kgcp.measurement.image_model.blur import Blur, variance_in_bins
 from kgcp.measurement.image_model.noise import find_censoring
+from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.image_model.plate import circles_of
 from kgcp.measurement.image_model.rolling_shutter import RollingShutter
 from kgcp.measurement.image_model.window import contour_px, cut_window, semi_major_axis_px
@@ -45,10 +46,11 @@ from kgcp.targets.layout import Target
 _MARGIN_PX = 12.0
 _SHARP_PX2, _LARGEST_START_BLUR = 0.5, 0.15  # of the radius
 _LARGEST_RADIUS_PX = 150.0  # enough for the last digit that calibrations can tell
-# In uneven light bins are not enough: of 30 simulated rings of R 150 to 275 px half in shade, with
-# dirt, or under highlights, distances were off by up to 0.03 %, 4 stated deviations. So many single
-# pixels, spread over them, leave up to 0.0045 %, and take 0.2 to 1 s. Still larger rings are seen
-# in bins again, which bounds the memory.
+# All that bins know of a tone curve or of clipping is how far they displace edges, which in uneven
+# light is not the same everywhere. Distances of 30 simulated rings of R 150 to 275 px half in
+# shade, with dirt, or under highlights were off by up to 0.03 %. So many single pixels, spread over
+# them, leave up to 0.0045 %, and take 0.1 to 1.2 s. Still larger rings are seen in bins again,
+# which bounds the memory.
 _MOST_PIXELS, _LARGEST_UNEVEN_PX = 6000, 300.0
 _DOUBTFUL_SIDE = 10.0  # Δχ² of the other pose below which more than this frame is asked
 _NOTHING_KNOWN = PlatePrior()
@@ -87,7 +89,8 @@ def measure_by_model(
     """
     pose = _without_edge_shift(start)
     problem = fit_problem_of(grey, camera, target, pose, prior.rotation)
-    problem = replace(problem, visible=visible)
+    may_be_finer = problem.tone is Tone.OF_BINS  # other bins are as good as single pixels
+    problem = replace(problem, visible=visible, may_be_finer=may_be_finer)
     blur = _start_blur(start, problem.window.binning)
     try:
         fits = fit_in_any_light(problem, pose, blur, prior.tone_base)

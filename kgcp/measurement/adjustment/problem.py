@@ -44,11 +44,8 @@ class FitProblem:
     # everywhere, as far as the search knows
     visible: BoolArray | None = None
     most_pixels: int | None = None  # that take part; None: all that are useful
-
-    @property
-    def can_be_finer(self) -> bool:
-        """Whether its pixels are bins, of which smaller ones were not tried."""
-        return self.window.binning > 1 and self.most_pixels is None
+    # whether light that is too uneven for its bins is to end in `UnevenLightInBins`
+    may_be_finer: bool = False
 
     @property
     def few_pixels(self) -> int | None:

@@ -142,8 +142,8 @@ def needs_varying_levels(fit: TargetFit) -> bool:
 
 
 def is_beyond_bins(fit: TargetFit) -> bool:
-    """Tell whether a ring is seen in bins, in light that is too uneven for them."""
-    return fit.sample.problem.can_be_finer and excess_of_cells(fit) > _BEYOND_BINS
+    """Tell whether the light is too uneven for bins, of which there may be smaller ones."""
+    return fit.sample.problem.may_be_finer and excess_of_cells(fit) > _BEYOND_BINS
 
 
 def fit_levels(

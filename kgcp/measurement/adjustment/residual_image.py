@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -69,8 +69,6 @@ def residual_image_of(
         As `kgcp.measurement.adjustment.fit_target.measure_by_model`.
     """
     problem = fit_problem_of(grey, camera, target, pose)
-    # for a picture bins are enough, whatever the light
-    problem = replace(problem, most_pixels=len(problem.window.levels))
     binning = problem.window.binning
     variance = variance_in_bins((blur_px or _USUAL_BLUR_PX) ** 2, binning)
     start = Parameters.of(pose, Blur(variance, variance, 0.0), first_levels(problem, pose))

@@ -85,7 +85,7 @@ class CameraTone:
     sharpening_px: float = 0.0  # σ of its unsharp mask; 0: it does not sharpen
     known: ProcessingPrior | None = None
     blur_px: float = 0.0  # median of those that it was learned from; 0: none
-    is_told: bool = True  # or compression has left too little of the curve to be sure of it
+    is_reliable: bool = True  # or compression has left too little of the photographs to tell it
 
 
 def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) -> CameraTone:
@@ -114,18 +114,18 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
         return CameraTone(tone, SHARPENING_PX)
     base = _BENT.get(min(plain, key=lambda joint: joint.loss).tone) if plain else None
     start = next((joint for joint in bent if joint.tone is base), None)
-    is_told = True
+    is_reliable = True
     if start is not None and len(fits) >= _FEWEST_DISCS:  # few tell too little of a curve
         steps = _steps_of(best.fits)
         best = _before_compression(best, start, steps)
-        is_told = best.is_settled and not _are_coarse(steps)
+        is_reliable = best.is_settled and not _are_coarse(steps)
     blur_px = float(np.median([fit.state.blur.mean_sd_px for fit in best.fits]))
     known = _known_by(best)
     if tone is Tone.UNKNOWN and not best.tone.is_shaped:
         # what an unknown curve may be off stays in the covariances
         known = _without_bends(known)
-        return CameraTone(_BENT[best.tone], best.sharpening_px, known, blur_px, is_told)
-    return CameraTone(best.tone, best.sharpening_px, known, blur_px, is_told)
+        return CameraTone(_BENT[best.tone], best.sharpening_px, known, blur_px, is_reliable)
+    return CameraTone(best.tone, best.sharpening_px, known, blur_px, is_reliable)
 
 
 def unknowns_of_disc(task: DiscTask, camera: CameraTone) -> DiscUnknowns:

@@ -57,7 +57,7 @@ class BlockScatter:
     """The scatter of one disc's scores over JPEG's blocks."""
 
     ratio: float  # mean ratio to that of independent residuals
-    left: float  # of that, after the fit: little, if there are few blocks
+    expected: float  # the latter scatter, after the fit: little, if there are few blocks
     count: float  # how many blocks of equal weight would tell as much
 
 
@@ -91,10 +91,10 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
     sums, products, arcs = _over_arcs(of_own, of_all, score, weight, _arcs(fit))
     ratio = scatter_ratio(sums, products, to_own, inverse)
     sums, products, _ = _over_arcs(of_own, of_all, score, weight, _blocks(fit))
-    left = max(_scatter_left(products, to_own, inverse), _NEARLY_NONE)
+    expected = max(_scatter_left(products, to_own, inverse), _NEARLY_NONE)
     shares = np.einsum("bkp,kp->b", products, to_own)
     equal = float(shares.sum() ** 2 / np.sum(shares * shares))
-    over_blocks = BlockScatter(float(np.sum(sums * sums)) / left, left, equal)
+    over_blocks = BlockScatter(float(np.sum(sums * sums)) / expected, expected, equal)
     if _edges_tell_displacement(fit):  # then `RingUnknowns` has what that does
         left_px = _TONED_RING_SHARE * fit.state.blur.mean_sd_px if fit.free.tone.is_shaped else 0.0
         common_px = max(_FLOOR_PX, left_px)
@@ -169,7 +169,7 @@ def inflations(scatters: Sequence[DiscScatter]) -> FloatArray:
     is_noise_alone = np.array([each.is_noise_alone for each in scatters])
     ratios = np.array([each.ratio for each in scatters])
     arcs = np.array([each.arcs for each in scatters], dtype=np.float64)
-    ratios[is_noise_alone] *= _left_by_blocks([each for each in scatters if each.is_noise_alone])
+    ratios[is_noise_alone] *= _blocks_over_arcs([each for each in scatters if each.is_noise_alone])
     in_common = _typical(ratios)
     of_chance = np.array(_ARC_VARIANCE / arcs.sum())
     shown = max(1.0 - float(beyond_chance(np.array(1.0 - in_common), of_chance)), _LEAST_FACTOR)
@@ -180,7 +180,7 @@ def inflations(scatters: Sequence[DiscScatter]) -> FloatArray:
     return least + beyond_chance(pooled - least, _ARC_VARIANCE * (arcs + shared) / weight**2)
 
 
-def _left_by_blocks(scatters: Sequence[DiscScatter]) -> float:
+def _blocks_over_arcs(scatters: Sequence[DiscScatter]) -> float:
     """Return the scatter over JPEG's blocks as a share of that over arcs; 1 if none was compressed.
 
     Errors of compression cancel each other over a block, and less so over arcs of edges, which are
@@ -190,8 +190,8 @@ def _left_by_blocks(scatters: Sequence[DiscScatter]) -> float:
     count = sum(each.count for each in blocks)
     if count < _FEWEST_BLOCKS:
         return 1.0
-    lefts = np.array([each.left for each in blocks])
-    over_blocks = _typical(np.array([each.ratio for each in blocks]), lefts)
+    weights = np.array([each.expected for each in blocks])
+    over_blocks = _typical(np.array([each.ratio for each in blocks]), weights)
     over_arcs = _typical(np.array([each.ratio for each in scatters]))
     of_chance = np.array(_BLOCK_VARIANCE / count)
     return 1.0 - float(beyond_chance(np.array(1.0 - over_blocks / over_arcs), of_chance))

@@ -137,8 +137,8 @@ def _check_level(
 
     A pixel of `image` is `factor` pixels of the frame wide, one of the level `coarser` times that.
     Samples are read by their distance from the place in the flattened image; only next to the
-    border their addresses are worked out one by one. The image is too large for the cache: rows
-    around later peaks are loaded beforehand, which halves the time.
+    border their addresses are worked out one by one. Large images do not fit into the cache: rows
+    around later peaks are loaded beforehand, which halves the time from 12 Mpx on.
     """
     height, width = image.shape
     pixels, reach = image.reshape(-1), fine_offsets.max()

@@ -206,7 +206,7 @@ def _camera_of(pool: WorkerPool, task: PhotoTask, photos: Sequence[Photo]) -> Ca
             stacklevel=2,
         )
         return None
-    if learned is not None and not learned.is_told:
+    if learned is not None and not learned.is_reliable:
         warnings.warn(
             "the photographs are compressed so much that they hardly tell their tone curve: sizes"
             " of the discs, and places where the light falls off steeply, are less certain than"

@@ -106,7 +106,7 @@ def test_cells_ask_for_levels_and_edges_where_cells_leave_a_doubt(
 def test_small_rings_are_in_even_light_where_levels_explain_little_more(
     monkeypatch: pytest.MonkeyPatch, *, radius_px: float, advantage: float, is_even: bool
 ) -> None:
-    problem = stand_in(outer_radius_px=radius_px, can_be_finer=False)
+    problem = stand_in(outer_radius_px=radius_px, may_be_finer=False)
     plain, varying = (stand_in(best=stand_in(sample=stand_in(problem=problem))) for _ in range(2))
     monkeypatch.setattr(extensions, "fit_both_poses", lambda *_: plain)
     monkeypatch.setattr(extensions, "_with_skew", lambda _, poses: poses)

@@ -186,18 +186,20 @@ def tasks_of(photos: Sequence[GreyArray]) -> list[list[DiscTask]]:
     return [[DiscTask(photo, each, []) for each in find_outlines(photo)] for photo in photos]
 
 
-def test_a_curve_is_not_told_if_rounds_do_not_settle(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_curve_is_unreliable_if_rounds_do_not_settle(monkeypatch: pytest.MonkeyPatch) -> None:
     tasks = tasks_of([compressed(photo, 92) for photo in small_discs(FILM, 0, 1)])
-    assert learn_tone(tasks, Response.UNKNOWN).is_told
+    assert learn_tone(tasks, Response.UNKNOWN).is_reliable
     monkeypatch.setattr(joint_tone, "_COMPRESSION_ROUNDS", 1)
-    assert not learn_tone(tasks, Response.UNKNOWN).is_told
+    assert not learn_tone(tasks, Response.UNKNOWN).is_reliable
 
 
 @pytest.mark.parametrize("sensor", [FILM, Sensor()])
-def test_a_curve_is_not_told_by_photographs_that_are_compressed_too_much(sensor: Sensor) -> None:
+def test_a_curve_from_strongly_compressed_photographs_is_unreliable(sensor: Sensor) -> None:
     tasks = tasks_of([compressed(photo, 75) for photo in small_discs(sensor, 0, 1)])
-    assert not learn_tone(tasks, Response.UNKNOWN).is_told
-    assert learn_tone(tasks, Response.SRGB).is_told  # nothing to be told
+    assert not learn_tone(tasks, Response.UNKNOWN).is_reliable
+    assert learn_tone(
+        tasks, Response.SRGB
+    ).is_reliable  # nothing is learnt of a curve that is stated
 
 
 def test_steps_beyond_a_limit_of_the_curve_gain_most_along_it() -> None:
