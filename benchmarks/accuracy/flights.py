@@ -26,6 +26,10 @@ from kgcp.pipeline.execution.resilient_map import usable_cores
 from kgcp.pipeline.frame_priors import priors_of_frames
 from kgcp.settings import DetectSettings
 
+HEADER = (
+    "flight               found   R ≥ 26  13–26 %   mean % ± 2 se   z dist centre    > 3 σ  Mahal.²"
+    "  wrong side"
+)
 _SIGMAS = 3.0
 
 
@@ -69,10 +73,7 @@ def line_of(name: str, flight: Flight, table: pd.DataFrame) -> str:
 @click.option("--jobs", type=click.IntRange(1, 256), default=None)
 def main(flights: tuple[Path, ...], jobs: int | None) -> None:
     """Print the table."""
-    print(
-        "flight               found   R ≥ 26  13–26 %   mean % ± 2 se   z dist centre"
-        "    > 3 σ  Mahal.²  wrong side"
-    )
+    print(HEADER)
     for folder in flights:
         beside = folder.parent / "truth.csv"
         truth = folder / "truth.csv" if (folder / "truth.csv").exists() else beside

@@ -92,6 +92,12 @@ PRESET_NAMES = (
     help="Give the point spread a tail: its third moment over the cube of its sigma.",
 )
 @click.option(
+    "--defocus",
+    type=click.FloatRange(0.0, 10.0),
+    metavar="PX",
+    help="Put the lens out of focus: the radius of the disc that a point becomes.",
+)
+@click.option(
     "--phone/--no-phone",
     default=None,
     help="Process frames as a phone does: Bayer mosaic, noise reduction, local tone mapping,"

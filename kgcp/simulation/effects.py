@@ -28,6 +28,7 @@ class Effects:
     glare: float = 0.0
     astigmatism: float = 1.0  # ratio of the largest σ of the point spread to the smallest
     coma: float = 0.0  # third central moment of the point spread along its tail, over psf³
+    defocus: float = 0.0  # radius of the disc that a point becomes by defocus [px]
     phone: bool = False  # whether frames are processed as a phone does it
     rolling: float = 0.0  # time from the first row to the last [s]
     # motion of the image during that time [px/s]; None: random, anew in each frame
@@ -47,6 +48,7 @@ class Effects:
             glare=settings.glare.peak[1] if settings.glare else 0.0,
             astigmatism=lens.astigmatism,
             coma=lens.coma,
+            defocus=lens.defocus_px,
             phone=settings.phone is not None,
             rolling=settings.camera.readout_s,
             motion=None if settings.motion.sd_px_s else settings.motion.mean_px_s,
@@ -68,9 +70,13 @@ def with_effects(settings: SimulationSettings, wanted: Effects) -> SimulationSet
     if wanted.glare != had.glare:
         peak = (_LEAST_PEAK * wanted.glare, wanted.glare)
         settings = replace(settings, glare=replace(settings.glare or Glare(), peak=peak))
-    if (wanted.astigmatism, wanted.coma) != (had.astigmatism, had.coma):
-        lens = settings.lens or Aberration()
-        lens = replace(lens, astigmatism=wanted.astigmatism, coma=wanted.coma)
+    lens = replace(
+        settings.lens or Aberration(),
+        astigmatism=wanted.astigmatism,
+        coma=wanted.coma,
+        defocus_px=wanted.defocus,
+    )
+    if lens != (settings.lens or Aberration()):
         settings = replace(settings, lens=lens)
     if wanted.phone != had.phone:
         settings = _as_of_a_phone(settings) if wanted.phone else replace(settings, phone=None)

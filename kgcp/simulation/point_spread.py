@@ -1,4 +1,4 @@
-"""Point spreads of real lenses: astigmatic and comatic, with their centroid where they belong.
+"""Point spreads of real lenses: astigmatic, comatic, out of focus, their centroid where it belongs.
 
 Coma is Seidel's: rays through the ring of relative radius ρ of the aperture meet the image on a
 circle of radius A ρ², 2 A ρ² away from the chief ray. Uniform light in the aperture puts the
@@ -6,6 +6,8 @@ centroid at A, variances A²/2 along and A²/6 across the tail, and third centra
 and A³/12 mixed. The spread is moved by −A, so that its centroid is the pixel that a calibration
 means, and the Gaussian that comes on top is made narrower by the coma's variances: second moments
 do not depend on the coma.
+
+Out of focus, the aperture's image is a uniform disc, on top of all that.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import j0
+from scipy.special import j0, j1
 
 from kgcp.errors import SettingError
 from kgcp.geometry.arrays import ComplexArray, FloatArray
@@ -33,10 +35,12 @@ class Aberration:
     astigmatism_deg: float = 35.0  # direction of the largest σ
     coma: float = 0.0  # third central moment along the tail, over psf³
     coma_deg: float = 110.0  # where the tail points
+    defocus_px: float = 0.0  # radius of the disc that a point out of focus becomes [px]
 
     def __post_init__(self) -> None:
         require_range("astigmatism", self.astigmatism, 1.0, 5.0)
         require_range("coma", self.coma, 0.0, _MOST_COMA)
+        require_range("defocus", self.defocus_px, 0.0, 10.0, unit="px")
         most = _MOST_COMA / self.astigmatism**1.5
         if self.coma > most:
             raise SettingError(
@@ -47,21 +51,32 @@ class Aberration:
 
     def reach_px(self, psf_px: float) -> float:
         """Return how far light is spread, at most [px]."""
-        return 5.0 * psf_px * math.sqrt(self.astigmatism) + 2.0 * self._circle_px(psf_px)
+        of_gaussian = 5.0 * psf_px * math.sqrt(self.astigmatism)
+        return of_gaussian + 2.0 * self._circle_px(psf_px) + self.defocus_px
 
     def covariance_px2(self, psf_px: float) -> FloatArray:
         """Return the second central moments (2, 2) of the whole spread [px²]."""
-        along = psf_px**2 * self.astigmatism
-        return _oriented(self.astigmatism_deg, along, psf_px**2 / self.astigmatism)
+        in_focus = self._covariance_in_focus_px2(psf_px)
+        return np.asarray(in_focus + 0.25 * self.defocus_px**2 * np.eye(2))
 
     def transfer(self, psf_px: float, fx: FloatArray, fy: FloatArray) -> FloatArray | ComplexArray:
         """Return the transfer function at frequencies that broadcast [cycles/px].
 
         It is complex if there is coma.
         """
+        transfer = self._transfer_in_focus(psf_px, fx, fy)
+        if self.defocus_px:
+            transfer *= _disc_transfer(self.defocus_px, fx, fy)
+        return transfer
+
+    def _transfer_in_focus(
+        self, psf_px: float, fx: FloatArray, fy: FloatArray
+    ) -> FloatArray | ComplexArray:
         circle_px = self._circle_px(psf_px)
         variances = circle_px**2 / 2.0, circle_px**2 / 6.0
-        (xx, xy), (_, yy) = self.covariance_px2(psf_px) - _oriented(self.coma_deg, *variances)
+        (xx, xy), (_, yy) = self._covariance_in_focus_px2(psf_px) - _oriented(
+            self.coma_deg, *variances
+        )
         form = xx * fx * fx + 2.0 * xy * fx * fy + yy * fy * fy
         gaussian: FloatArray = np.exp(-2.0 * math.pi**2 * form)
         if circle_px == 0.0:
@@ -71,6 +86,10 @@ class Aberration:
         transfer: ComplexArray = np.zeros(gaussian.shape, dtype=np.complex128)
         transfer[matters] = gaussian[matters] * _coma_transfer(circle_px, self.coma_deg, fx, fy)
         return transfer
+
+    def _covariance_in_focus_px2(self, psf_px: float) -> FloatArray:
+        along = psf_px**2 * self.astigmatism
+        return _oriented(self.astigmatism_deg, along, psf_px**2 / self.astigmatism)
 
     def _circle_px(self, psf_px: float) -> float:
         """Return A, the radius of the circle that the rim of the aperture makes [px]."""
@@ -82,6 +101,13 @@ def _oriented(direction_deg: float, along: float, across: float) -> FloatArray:
     angle = math.radians(direction_deg)
     axis = np.array([math.cos(angle), math.sin(angle)])
     return np.asarray(across * np.eye(2) + (along - across) * np.outer(axis, axis))
+
+
+def _disc_transfer(radius_px: float, fx: FloatArray, fy: FloatArray) -> FloatArray:
+    """Return the transfer of a uniform disc at frequencies that broadcast, 2 J₁(u) / u."""
+    turn = 2.0 * math.pi * radius_px * np.hypot(fx, fy)
+    in_middle = turn < _NEGLIGIBLE
+    return np.where(in_middle, 1.0, 2.0 * j1(turn) / np.where(in_middle, 1.0, turn))
 
 
 def _coma_transfer(

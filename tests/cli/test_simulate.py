@@ -61,6 +61,7 @@ EFFECTS: dict[str, Any] = {
     "stains": 4,
     "glare": 0.3,
     "astigmatism": 1.4,
+    "defocus": 1.5,
     "coma": 0.1,
     "phone": True,
     "rolling": 0.02,
@@ -83,7 +84,8 @@ def test_options_of_effects_reach_the_flight_and_its_readme(tmp_path: Path) -> N
     out = tmp_path / "flight"
     options = [
         *("--shadow", "0.6", "--stripes", "2", "--dirt", "0.03", "--stains", "4"),
-        *("--glare", "0.3", "--astigmatism", "1.4", "--coma", "0.1", "--phone"),
+        *("--glare", "0.3", "--astigmatism", "1.4", "--coma", "0.1"),
+        *("--defocus", "1.5", "--phone"),
         *("--rolling", "0.02", "--motion", "30", "-40"),
     ]
     only = ["--preset", "sample", "--frames", "1"]

@@ -321,7 +321,7 @@ def test_in_even_light_nothing_changes(
     pose = some_pose(rng)
     grey, start = photograph(LENS, pose, rng), start_near(LENS, pose, rng)
     seen = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
-    for gate in ("needs_varying_levels", "needs_skew"):
+    for gate in ("needs_varying_levels", "shape_needed"):
         monkeypatch.setattr(extensions, gate, lambda _: False)
     plain = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
     assert seen.pose.matrix.tobytes() == plain.pose.matrix.tobytes()

@@ -40,6 +40,17 @@ def test_the_centroid_of_coma_stays_where_it_is(coma: float, direction_deg: floa
     assert abs((image * y).sum()) < 1e-6
 
 
+def test_defocus_spreads_a_point_over_a_disc() -> None:
+    focused, defocused = image_of(Aberration()), image_of(Aberration(defocus_px=FINE * 1.6))
+    x, _ = axes()
+    assert defocused.sum() == pytest.approx(1.0, abs=1e-8)
+    variance = ((defocused - focused) * x * x).sum()
+    assert variance == pytest.approx(1.6**2 / 4.0, rel=1e-3)
+    # fourth cumulants add up, and a Gaussian has none: a⁴/8 − 3 (a²/4)² along each axis
+    fourth = (defocused * x**4).sum() - 3.0 * (0.8**2 + variance) ** 2
+    assert fourth == pytest.approx(-(1.6**4) / 16.0, rel=5e-3)
+
+
 @pytest.mark.parametrize("coma", [0.0, 0.2])
 def test_second_moments_are_those_of_the_astigmatism(coma: float) -> None:
     aberration = Aberration(1.6, 35.0, coma, 110.0)

@@ -1,4 +1,4 @@
-"""Extensions of the plain model where its residuals need them: varying levels, a skew point spread.
+"""Extensions of the plain model where its residuals need them: varying levels, other point spreads.
 
 The plain model is fitted first. If its residuals need no extension, its result stands.
 """
@@ -30,21 +30,25 @@ from kgcp.measurement.adjustment.plateaus import (
 )
 from kgcp.measurement.adjustment.problem import SMALL_RING_PX, FitProblem
 from kgcp.measurement.adjustment.random_levels import (
+    chi2_with_levels,
     even_field,
     fit_levels,
     is_beyond_bins,
     needs_varying_levels,
 )
-from kgcp.measurement.adjustment.skewed import needs_skew, with_skew
 from kgcp.measurement.adjustment.solver import TargetFit, adjust
+from kgcp.measurement.adjustment.spread_shape import (
+    KURTOSIS_CHI2_WITH_LEVELS,
+    shape_needed,
+    with_shape,
+)
 from kgcp.measurement.adjustment.two_poses import TwoPoses, fit_at, fit_both_poses
 from kgcp.measurement.adjustment.unknowns import unknowns_of, without_even_light
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.image_model.photometry import PARAM_COUNT, Light, Param, Tone, decoded
 from kgcp.measurement.records import ToneBase
 
-_NUDGE = np.zeros(PARAM_COUNT)
-_NUDGE[Param.SKEW_XXX :] = 1e-6  # px³: without any skew its derivatives are left out
+_NUDGE = 1e-6  # without any skew or kurtosis, their derivatives are left out
 # Inflation of the covariance by residuals that agree along edges, where levels vary: above, the fit
 # has probably ended beside its minimum. Of 58 frames with dirt, the five whose fit did have 3.9 to
 # 5.7, and nearly all others less than 3.
@@ -156,7 +160,7 @@ def _fit_in_any_light(
         Only if the problem `may_be_finer`.
     """
     try:
-        plain = _with_skew(problem, fit_both_poses(problem, pose, blur))
+        plain = _with_shape(problem, fit_both_poses(problem, pose, blur))
     except Rejection:
         plateaus = find_plateaus()
         if plateaus is None or not plateaus.is_uneven:
@@ -189,13 +193,16 @@ def _may_be_even(plain: TargetFit, varying: TargetFit) -> bool:
 def _in_seen_light(problem: FitProblem, pose: Pose, blur: Blur, plateaus: Plateaus) -> TwoPoses:
     """Adjust both poses with levels that vary from those that are seen on ink and plate."""
     poses = fit_both_poses(evened_window(problem, plateaus), pose, blur)
-    return _with_skew(problem, _with_seen_levels(problem, poses, plateaus))
+    return _with_kurtosis(
+        problem, _with_shape(problem, _with_seen_levels(problem, poses, plateaus))
+    )
 
 
-def _with_skew(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
-    """Let the point spread be skew, if the residuals need it."""
+def _with_shape(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
+    """Let the point spread be skew, or of another kurtosis, if the residuals need it."""
     best, other = poses.best, poses.other
-    if not needs_skew(best):
+    shape = shape_needed(best)
+    if not shape:
         return poses
     spreads = [(best.parameters, best.unknowns)]
     blur = best.parameters.blur
@@ -207,29 +214,43 @@ def _with_skew(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
         unknowns = unknowns_of(problem, has_streak=False)
         is_even = gaussian.field is None
         spreads.append((gaussian, unknowns if is_even else without_even_light(unknowns)))
-    skewed = []
+    shaped = []
     for parameters, unknowns in spreads:
         with contextlib.suppress(Rejection):  # then the plain model is the better one
-            skewed.append(
-                _fit_skewed(problem, parameters, other.parameters.pose, with_skew(unknowns))
+            shaped.append(
+                _fit_shaped(problem, parameters, other.parameters.pose, with_shape(unknowns, shape))
             )
-    if not skewed:
+    if not shaped:
         return poses
-    likelier = skewed[0]
-    for poses_skewed in skewed[1:]:
-        if advantage_over(likelier.best, poses_skewed.best) > 0.0:
-            likelier = poses_skewed
+    likelier = shaped[0]
+    for each in shaped[1:]:
+        if advantage_over(likelier.best, each.best) > 0.0:
+            likelier = each
     return likelier
 
 
-def _fit_skewed(
+def _with_kurtosis(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
+    """Let the kurtosis of the point spread be free beside levels that vary, if it must be."""
+    best, other = poses.best, poses.other
+    if best.level_equations is None or best.parameters.has_kurtosis:
+        return poses
+    unknowns = with_shape(best.unknowns, [int(Param.KURTOSIS)])
+    with contextlib.suppress(Rejection):  # then it is better without
+        if chi2_with_levels(best, unknowns, Param.KURTOSIS) > KURTOSIS_CHI2_WITH_LEVELS:
+            return _fit_shaped(problem, best.parameters, other.parameters.pose, unknowns)
+    return poses
+
+
+def _fit_shaped(
     problem: FitProblem, start: Parameters, other: Pose, unknowns: Unknowns
 ) -> TwoPoses:
-    nudged = replace(start, vector=start.vector + _NUDGE)
+    nudge = np.zeros(PARAM_COUNT)
+    nudge[unknowns.free[unknowns.free >= Param.SKEW_XXX]] = _NUDGE
+    nudged = replace(start, vector=start.vector + nudge)
     if nudged.field is not None:
         return TwoPoses(*fit_levels(problem, [nudged], other, unknowns))
-    skewed = adjust(problem, nudged, unknowns)
-    return TwoPoses(skewed, fit_at(skewed, other))
+    shaped = adjust(problem, nudged, unknowns)
+    return TwoPoses(shaped, fit_at(shaped, other))
 
 
 def _with_levels(problem: FitProblem, poses: TwoPoses) -> TwoPoses:

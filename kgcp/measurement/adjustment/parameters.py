@@ -21,7 +21,8 @@ _MAX_ANISOTROPY = 0.95
 _MEAN, _DIFFERENCE, _XY = int(Param.BLUR_MEAN), int(Param.BLUR_DIFFERENCE), int(Param.BLUR_XY)
 
 _OF_BLUR, _OF_LIGHT = slice(_MEAN, int(Param.BLACK)), slice(int(Param.BLACK), int(Param.SKEW_XXX))
-_OF_SKEW = slice(int(Param.SKEW_XXX), None)
+_OF_SHAPE = slice(int(Param.SKEW_XXX), None)
+_OF_SKEW = slice(int(Param.SKEW_XXX), int(Param.KURTOSIS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +30,7 @@ class Parameters:
     """A pose, a blur and a light, as the numbers that the adjustment works with."""
 
     matrix: FloatArray  # (3, 4): of the pose: rotation and translation [m], target → camera
-    vector: FloatArray  # (25,): all others in the order of `Param`, with zeros for the pose
+    vector: FloatArray  # (26,): all others in the order of `Param`, with zeros for the pose
     field: LightField | None = None  # of light that is not the same everywhere
 
     @staticmethod
@@ -37,7 +38,8 @@ class Parameters:
         """Collect the numbers."""
         mean, difference = 0.5 * (blur.xx + blur.yy), 0.5 * (blur.xx - blur.yy)
         of_blur = (mean, difference, blur.xy, blur.streak_x, blur.streak_y)
-        return Parameters(pose.matrix, np.array((*_NO_POSE, *of_blur, *light.values, *blur.skew)))
+        of_shape = (*blur.skew, blur.kurtosis)
+        return Parameters(pose.matrix, np.array((*_NO_POSE, *of_blur, *light.values, *of_shape)))
 
     @cached_property
     def pose(self) -> Pose:
@@ -48,9 +50,9 @@ class Parameters:
     def blur(self) -> Blur:
         """The blur."""
         mean, difference, xy, streak_x, streak_y = self.vector[_OF_BLUR].tolist()
-        xxx, xxy, xyy, yyy = self.vector[_OF_SKEW].tolist()
+        xxx, xxy, xyy, yyy, kurtosis = self.vector[_OF_SHAPE].tolist()
         skew = (xxx, xxy, xyy, yyy)
-        return Blur(mean + difference, mean - difference, xy, streak_x, streak_y, skew)
+        return Blur(mean + difference, mean - difference, xy, streak_x, streak_y, skew, kurtosis)
 
     @cached_property
     def light(self) -> Light:
@@ -62,12 +64,17 @@ class Parameters:
         """Whether the point spread is skew."""
         return any(self.vector[_OF_SKEW].tolist())
 
+    @property
+    def has_kurtosis(self) -> bool:
+        """Whether the point spread is more or less peaked than a Gaussian."""
+        return bool(self.vector[Param.KURTOSIS])
+
     def at(self, pose: Pose) -> Parameters:
         """Return the same blur and light at another pose."""
         return Parameters(pose.matrix, self.vector, self.field)
 
     def moved(self, step: FloatArray) -> Parameters:
-        """Return the parameters after a step (25,) in the order of `Param`.
+        """Return the parameters after a step (26,) in the order of `Param`.
 
         That of the pose is a translation [m] and a left rotation vector [rad].
         """

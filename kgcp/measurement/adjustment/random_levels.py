@@ -61,6 +61,7 @@ from kgcp.measurement.image_model.photometry import (
 # continued from their end, by three phases more, move by 0.05 σ of the distance or less (RMS; in
 # dirt, under highlights and in mixtures), under shadows by 0.1 σ.
 _ROUNDS, _PHASES, _STEPS = 2, 3, 8
+_ALL_BUT_ZERO = 1e-6  # a parameter of which derivatives are asked for
 _LEAST_GAIN = 0.05  # of log-likelihood
 # If the other pose is worse by so much log-likelihood after two steps, it stays the worse one: of
 # 240, the 90 that were ended worse by 4300 or more. One that was worse by 1600 became the better.
@@ -180,6 +181,23 @@ def fit_levels(
         hopeless_total=first.total + _HOPELESS,
     )
     return (second, first) if second.total < first.total else (first, second)
+
+
+def chi2_with_levels(fit: TargetFit, unknowns: Unknowns, param: Param) -> float:
+    """Return the χ² by which residuals of a fit with levels ask for one more parameter.
+
+    `unknowns` are those of the fit and the parameter, which is zero so far.
+    """
+    vector = fit.parameters.vector.copy()
+    vector[param] = _ALL_BUT_ZERO
+    parameters = replace(fit.parameters, vector=vector)
+    _, jacobian = linearise(fit.sample, parameters)
+    at_knots = _equations_of(fit).at_knots
+    reduced = _equations(fit.sample, parameters, jacobian, fit.sd, unknowns, fit.misfit, at_knots)
+    moved, _ = _WithLevels(reduced, unknowns).proposed(fit.misfit, parameters, 0.0)
+    k = int(np.searchsorted(unknowns.free, param))
+    variance = float(np.linalg.inv(reduced.normal)[k, k])
+    return float(moved.vector[param] - vector[param]) ** 2 / variance
 
 
 def _adjust_levels(problem: FitProblem, start: Parameters, unknowns: Unknowns) -> TargetFit:

@@ -20,10 +20,15 @@ from kgcp.measurement.adjustment.normal_equations import (
 from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.adjustment.pixels import Sample, select_pixels
 from kgcp.measurement.adjustment.problem import FitProblem
-from kgcp.measurement.image_model.blurred_plate import WhiteShare, white_share, white_share_only
+from kgcp.measurement.image_model.blurred_plate import (
+    WhiteShare,
+    kurtosis_row,
+    white_share,
+    white_share_only,
+)
 from kgcp.measurement.image_model.edge_terms import skew_rows, spread_share_gradient
 from kgcp.measurement.image_model.noise import GreyNoise, Misfit, estimate_noise, misfit
-from kgcp.measurement.image_model.photometry import Param
+from kgcp.measurement.image_model.photometry import SHAPE_PARAMS, Param
 
 EquationsOf = Callable[[Parameters, FloatArray, Misfit], Equations]
 
@@ -121,8 +126,8 @@ def _with_edge_terms(
     """
     value, jacobian, field = share.value, share.jacobian, parameters.field
     covariance = parameters.blur.total_covariance
-    if parameters.has_skew:
-        rows = skew_rows(share.views, covariance, sample.incidence)
+    if parameters.has_skew or parameters.has_kurtosis:
+        rows = _shape_rows(share, sample, parameters)
         value = value + parameters.vector[Param.SKEW_XXX :] @ rows
         jacobian = np.vstack((jacobian, rows)) if len(jacobian) else jacobian
     if field is None:
@@ -132,6 +137,21 @@ def _with_edge_terms(
     contrast = np.maximum(1.0 + added[1] - added[0], _LEAST_CONTRAST)
     value = value + np.sum(gradient * spread, axis=0) / contrast
     return WhiteShare(share.views, value, jacobian), added
+
+
+def _shape_rows(share: WhiteShare, sample: Sample, parameters: Parameters) -> FloatArray:
+    """Return the derivatives (5, n) of the white share by third and fourth cumulants.
+
+    They are 0 by those that the point spread does not have.
+    """
+    rows, blur = np.zeros((len(SHAPE_PARAMS), len(share.value))), parameters.blur
+    if parameters.has_skew:
+        rows[:-1] = skew_rows(share.views, blur.total_covariance, sample.incidence)
+    if parameters.has_kurtosis:
+        rows[-1] = kurtosis_row(
+            share.value, parameters.matrix, sample.rays, blur.vector, sample.incidence
+        )
+    return rows
 
 
 def approach(sample: Sample, start: Parameters, unknowns: Unknowns) -> TargetFit:

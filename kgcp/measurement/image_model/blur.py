@@ -30,6 +30,7 @@ class Blur:
     streak_y: float = 0.0
     # (4,): third cumulants xxx, xxy, xyy, yyy [px³]
     skew: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    kurtosis: float = 0.0  # excess of the Gaussian part's, in all directions
 
     @property
     def has_streak(self) -> bool:
@@ -43,11 +44,13 @@ class Blur:
         cube = square * factor
         xxx, xxy, xyy, yyy = self.skew
         skew = (cube * xxx, cube * xxy, cube * xyy, cube * yyy)
-        return Blur(square * self.xx, square * self.yy, square * self.xy, *streak, skew)
+        return Blur(
+            square * self.xx, square * self.yy, square * self.xy, *streak, skew, self.kurtosis
+        )
 
     @property
     def vector(self) -> FloatArray:
-        """All but the skew, in the order of the attributes."""
+        """All but skew and kurtosis, in the order of the attributes."""
         return np.array([self.xx, self.yy, self.xy, self.streak_x, self.streak_y])
 
     @property

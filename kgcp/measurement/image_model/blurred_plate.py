@@ -22,6 +22,8 @@ from kgcp.measurement.image_model.ray_plate import (
     views_of,
 )
 
+_SPREAD = 0.3  # q below: larger ones reach beyond the pixels that feel an edge
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WhiteShare:
@@ -66,6 +68,32 @@ def white_share_only(
     """Return the white share of every pixel without derivatives, at less than half the cost."""
     views, on_plate = _rendered(pose, rays, blur, incidence, 1)
     return WhiteShare(views, on_plate[0], np.empty((0, rays.shape[1])))
+
+
+def kurtosis_row(
+    share: FloatArray,
+    pose: FloatArray,
+    rays: FloatArray,
+    blur: FloatArray,
+    incidence: EdgeIncidence,
+) -> FloatArray:
+    """Return the derivative (n,) of a white share by the excess kurtosis of the Gaussian spread.
+
+    A spread that is half the Gaussian of covariance (1 + q) Σ and half that of (1 − q) Σ has the
+    excess kurtosis 3 q² in all directions, and moments up to the third as if both were Σ. So the
+    second difference of the share by q is what kurtosis does to it, whatever the sign.
+
+    Parameters
+    ----------
+    share : (n,) array
+        By `white_share`; the other parameters are those it is made with.
+    """
+    changed = np.zeros(len(share))
+    for factor in (1.0 + _SPREAD, 1.0 - _SPREAD):
+        of_factor = blur.copy()
+        of_factor[:3] *= factor
+        changed += white_share_only(pose, rays, of_factor, incidence).value
+    return np.asarray((changed - 2.0 * share) / (6.0 * _SPREAD**2))
 
 
 def _rendered(

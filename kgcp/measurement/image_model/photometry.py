@@ -83,10 +83,11 @@ class Param(IntEnum):
     SKEW_XXY = 22
     SKEW_XYY = 23
     SKEW_YYY = 24
+    KURTOSIS = 25
 
 
-PARAM_COUNT = 25
-PLAIN_COUNT = 21  # without the skew
+PARAM_COUNT = 26
+PLAIN_COUNT = 21  # without the shape of the point spread
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,9 +155,10 @@ _FILTERED = [Param.BLACK, Param.WHITE, *range(9)]
 _TONE_ROWS = [Param.TONE_1, Param.TONE_2, Param.TONE_3]
 _LEVEL_ROWS = [Param.BLACK, Param.WHITE, *_TONE_ROWS]
 SKEW_PARAMS = [int(Param.SKEW_XXX), int(Param.SKEW_XXY), int(Param.SKEW_XYY), int(Param.SKEW_YYY)]
-_RARE_ROWS = np.array([Param.STREAK_X, Param.STREAK_Y, *SKEW_PARAMS])
+SHAPE_PARAMS = [*SKEW_PARAMS, int(Param.KURTOSIS)]
+_RARE_ROWS = np.array([Param.STREAK_X, Param.STREAK_Y, *SHAPE_PARAMS])
 _SHARE_STEPS = 400
-GEOMETRY_ROWS = 11  # of pose and blur, without the skew
+GEOMETRY_ROWS = 11  # of pose and blur, without the shape of the point spread
 # Beyond ink and plate, where curves still follow their formula; light in shade is mostly between.
 _CURVED_BELOW, _CURVED_ABOVE = 0.05, 0.1
 _MEAN_SQUARE = 0.625  # of the distances of both edges from the centre, in ring radii
@@ -267,12 +269,12 @@ class PhotometricModel:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the grey values (n,) and their Jacobian; `added` as in `levels`.
 
-        It has 21 rows, or 25 where the point spread is skew. Where the light is uneven it has 27,
-        the last two by what is added to ink and to plate.
+        It has 21 rows, or 26 where the point spread has a shape. Where the light is uneven it has
+        28, the last two by what is added to ink and to plate.
         """
         value = np.empty(len(share.value))
-        has_skew = len(share.jacobian) > GEOMETRY_ROWS
-        rows = PARAM_COUNT if has_skew or added is not None else PLAIN_COUNT
+        has_shape = len(share.jacobian) > GEOMETRY_ROWS
+        rows = PARAM_COUNT if has_shape or added is not None else PLAIN_COUNT
         jacobian = np.empty((rows + (0 if added is None else 2), len(value)))
         has_tone = self.tone.is_shaped
         _expose_with_slopes(
@@ -497,13 +499,13 @@ def _expose_with_slopes(
     value: FloatArray,
     jacobian: FloatArray,
 ) -> None:
-    """Extend `_expose` by derivatives: by geometry (11 or 15, n), then in the order of `Param`.
+    """Extend `_expose` by derivatives: by geometry (11 or 16, n), then in the order of `Param`.
 
     Where the light is uneven, those by what is added to ink and to plate follow.
     """
     black, white, _, _, _, tone_1, tone_2, tone_3, _, _ = light
     contrast, gains = white - black, np.empty(len(share))
-    has_skew = by_geometry.shape[0] > 11
+    has_shape = by_geometry.shape[0] > 11
     each = 1 if added.shape[1] > 1 else 0
     for i in range(len(share)):
         ink, plate = added[0, each * i], 1.0 + added[1, each * i]
@@ -526,11 +528,11 @@ def _expose_with_slopes(
         jacobian[16, i], jacobian[17, i], jacobian[18, i] = bend * by_1, bend * by_2, bend * by_3
         jacobian[19, i] = jacobian[20, i] = 0.0
         if each:
-            jacobian[25, i] = gain * slope * (1.0 - share[i])
-            jacobian[26, i] = gain * slope * share[i]
-    for k in range(21, min(25, len(jacobian))):
+            jacobian[26, i] = gain * slope * (1.0 - share[i])
+            jacobian[27, i] = gain * slope * share[i]
+    for k in range(21, min(26, len(jacobian))):
         for i in range(len(share)):
-            jacobian[k, i] = gains[i] * by_geometry[k - 10, i] if has_skew else 0.0
+            jacobian[k, i] = gains[i] * by_geometry[k - 10, i] if has_shape else 0.0
     for k in range(11):
         for i in range(len(share)):
             jacobian[k, i] = gains[i] * by_geometry[k, i]

@@ -109,7 +109,7 @@ def test_small_rings_are_in_even_light_where_levels_explain_little_more(
     problem = stand_in(outer_radius_px=radius_px, may_be_finer=False)
     plain, varying = (stand_in(best=stand_in(sample=stand_in(problem=problem))) for _ in range(2))
     monkeypatch.setattr(extensions, "fit_both_poses", lambda *_: plain)
-    monkeypatch.setattr(extensions, "_with_skew", lambda _, poses: poses)
+    monkeypatch.setattr(extensions, "_with_shape", lambda _, poses: poses)
     monkeypatch.setattr(extensions, "needs_varying_levels", lambda _: True)
     monkeypatch.setattr(extensions, "_with_levels", lambda *_: varying)
     monkeypatch.setattr(extensions, "advantage_over", lambda *_: advantage)

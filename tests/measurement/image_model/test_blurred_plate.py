@@ -7,13 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.image_model.blur import Blur, EdgeIncidence, find_edge_incidence
-from kgcp.measurement.image_model.blurred_plate import white_share, white_share_only
+from kgcp.measurement.image_model.blurred_plate import (
+    kurtosis_row,
+    white_share,
+    white_share_only,
+)
 from kgcp.measurement.image_model.edge_terms import smoothing_row
 from kgcp.measurement.image_model.plate import (
     EVEN,
@@ -126,6 +131,40 @@ def test_levels_are_those_of_a_finely_sampled_blurred_plate(distance_m: float) -
     difference = (seen.value - expected)[np.hypot(*seen.points_m) < 0.6]
     assert np.abs(difference).max() < 0.02  # 16 × 16 samples know an edge to 1/32 px
     assert abs(difference.mean()) < 5e-4
+
+
+@pytest.mark.parametrize(
+    ("radius_px", "distance_m", "share_left"),
+    [(1.5, 60.0, 0.65), (2.0, 60.0, 0.4), (2.0, 120.0, 0.45)],
+)
+def test_kurtosis_is_most_of_what_a_disc_of_light_differs_from_a_gaussian(
+    radius_px: float, distance_m: float, share_left: float
+) -> None:
+    pose = Pose(POSE.rotation, POSE.translation_m * (distance_m / POSE.distance_m))
+    centre, fine, sd_px = np.round(CAMERA.project(pose.translation_m[None])[0]), 8, 0.75
+    half = int(0.6 * 2300.0 / distance_m) + 6
+    offsets = (np.arange((2 * half + 1) * fine) + 0.5) / fine - 0.5 - half
+    x, y = np.meshgrid(centre[0] + offsets, centre[1] + offsets)
+    fine_rays = rays_of(np.column_stack((x.ravel(), y.ravel())))
+    exact = exact_plate(plate_points(pose, fine_rays), CIRCLES).reshape(x.shape)
+    reach = int(radius_px * fine) + 1
+    across = np.arange(-reach, reach + 1) / fine
+    disc = (np.hypot(across[None, :], across[:, None]) < radius_px).astype(float)
+    blurred = gaussian_filter(exact, sd_px * fine, truncate=6.0)
+    blurred = fftconvolve(blurred, disc / disc.sum(), mode="same")
+    size = 2 * half + 1
+    expected = blurred.reshape(size, fine, size, fine).mean(axis=(1, 3)).ravel()
+    variance = sd_px**2 + 1.0 / 12.0 + radius_px**2 / 4.0
+    blur, rays = Blur(variance, variance, 0.0), rays_of(pixels_around(centre, half))
+    incidence = pairs_of(pose, rays, blur)
+    seen = white_share_only(pose.matrix, rays, blur.vector, incidence)
+    row = kurtosis_row(seen.value, pose.matrix, rays, blur.vector, incidence)
+    kurtosis = -(radius_px**4 / 16.0 + 1.0 / 120.0) / variance**2  # of the disc, and of a pixel
+    on_plate = np.hypot(*seen.points_m) < 0.5
+    without = (seen.value - expected)[on_plate]
+    left = without + kurtosis * row[on_plate]
+    assert np.abs(without).max() > 0.015
+    assert np.sqrt(np.mean(left**2)) < share_left * np.sqrt(np.mean(without**2))
 
 
 @pytest.mark.parametrize("streak", [(0.0, 0.0), (3.0, -2.0)])

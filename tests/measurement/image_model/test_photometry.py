@@ -264,7 +264,7 @@ def test_steps_add_to_every_parameter_in_order() -> None:
     start = Parameters.of(Pose(np.eye(3), np.array([0.0, 0.0, 9.0])), Blur(0.6, 0.4, 0.05), LIGHT)
     of_light = np.linspace(-0.02, 0.02, len(fields(Light)))
     skew = (0.01, -0.02, 0.03, 0.04)
-    step = np.array([0.0] * 6 + [0.1, 0.02, -0.03, 0.5, -0.4, *of_light, *skew])
+    step = np.array([0.0] * 6 + [0.1, 0.02, -0.03, 0.5, -0.4, *of_light, *skew, -0.3])
     moved = start.moved(step)
     np.testing.assert_allclose(moved.vector, start.vector + step)
 

@@ -1,0 +1,72 @@
+"""Whether a point spread is skew, or of another kurtosis than a Gaussian, from residuals."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.measurement.adjustment.normal_equations import Unknowns, normal_matrix
+from kgcp.measurement.adjustment.solver import TargetFit
+from kgcp.measurement.image_model.blurred_plate import kurtosis_row
+from kgcp.measurement.image_model.edge_terms import skew_rows
+from kgcp.measurement.image_model.photometry import SHAPE_PARAMS, SKEW_PARAMS, Param
+from kgcp.measurement.image_model.ray_plate import views_of
+
+_SKEW_SD_PX3 = 1.0  # skewness 0.6 of a spread of 1.2 px
+# Defocus alone has an excess kurtosis of −1, with a pixel and a lens's own blur −0.4 to −0.7. A
+# weaker prior makes rings of R < 13 px worse.
+_KURTOSIS_SD = 0.5
+# χ² of four degrees of freedom: the 98 targets of six flights of `benchmarks.accuracy` without skew
+# have 13 at most, the 14 of light/lens 35 and more.
+_SKEW_CHI2 = 25.0
+# χ² of one degree of freedom: 88 fits in focus and in even light have 10 at most, those of a coarse
+# renderer 27. Blurred to discs of 1 px radius by defocus, rings of R ≥ 19 px have 19 to 132; of
+# 1.5 px, rings of all sizes 19 and more.
+_KURTOSIS_CHI2 = 16.0
+KURTOSIS_CHI2_WITH_LEVELS = 40.0
+"""χ² from which on kurtosis is free beside levels that vary.
+
+Over the right base of the tone curve, 32 rings in focus under shadows and highlights have less than
+this, and of 32 out of focus by 2 px, those of R ≥ 17 px have more.
+"""
+
+
+def shape_needed(fit: TargetFit) -> list[int]:
+    """Return which parameters of the point spread's shape residuals ask for (score tests).
+
+    Behind a lens whose spread is skew, its kurtosis is not that of a Gaussian either. Levels that
+    vary would take part of a skew that is not asked for: with them it always is, which costs next
+    to nothing (43 plates under shadows: errors and deviations the same within 5 %). Kurtosis beside
+    them is asked for by `KURTOSIS_CHI2_WITH_LEVELS`; otherwise it would let fits rest where they
+    start (by 0.6 σ in a test).
+    """
+    if fit.sample.problem.window.binning > 1 or fit.unknowns.free[-1] >= SHAPE_PARAMS[0]:
+        return []
+    if fit.level_equations is not None:
+        return SKEW_PARAMS
+    by_shape, scaled = _by_shape(fit) / fit.sd, fit.scaled_jacobian
+    normal = normal_matrix(scaled, fit.misfit, fit.unknowns)
+    score, weighted = by_shape @ fit.misfit.score, by_shape * fit.misfit.weight
+    mixed = scaled @ weighted.T
+    own = weighted @ by_shape.T - mixed.T @ np.linalg.solve(normal, mixed)
+    if score[:-1] @ np.linalg.solve(own[:-1, :-1], score[:-1]) > _SKEW_CHI2:
+        return SHAPE_PARAMS
+    return [int(Param.KURTOSIS)] if score[-1] ** 2 > _KURTOSIS_CHI2 * own[-1, -1] else []
+
+
+def _by_shape(fit: TargetFit) -> FloatArray:
+    """Return the derivatives (5, n) of the grey values by skew and kurtosis; the rest is known."""
+    sample, parameters, share = fit.sample, fit.parameters, fit.prediction.share
+    views, blur = views_of(parameters.matrix, sample.rays), parameters.blur
+    skew = skew_rows(views, blur.total_covariance, sample.incidence)
+    kurtosis = kurtosis_row(share, parameters.matrix, sample.rays, blur.vector, sample.incidence)
+    rows = np.vstack((skew, kurtosis))
+    return sample.photometry.level_changes(share, parameters.light, rows)
+
+
+def with_shape(unknowns: Unknowns, shape: list[int]) -> Unknowns:
+    """Return the unknowns with some parameters of the point spread's shape among them."""
+    free = np.append(unknowns.free, shape)
+    precision = unknowns.precision.copy()
+    precision[SKEW_PARAMS], precision[Param.KURTOSIS] = _SKEW_SD_PX3**-2, _KURTOSIS_SD**-2
+    return Unknowns(free, unknowns.mean, precision, precision[free])
