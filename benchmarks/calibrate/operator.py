@@ -28,6 +28,7 @@ from kgcp.measurement.discs.records import Disc, Operator, Polarity
 from kgcp.pipeline.execution.threads import use_one_thread_each
 from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, field_circles, photograph
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
+from kgcp.simulation.point_spread import Aberration
 
 _FOCAL_PX = 200_000.0  # so long that images are affine
 _COLUMNS, _ROWS = 5, 4  # of a photograph
@@ -52,6 +53,12 @@ class Case:
     gain: float = 1.0
     sharpening: float = 0.0
     quality: int = 0  # of JPEG; 0: none
+    defocus_px: float = 0.0  # radius of the disc that a point becomes
+
+    @property
+    def optics(self) -> Optics:
+        """The lens."""
+        return Optics(_PSF_PX, aberration=Aberration(defocus_px=self.defocus_px))
 
 
 CASES = {
@@ -66,6 +73,15 @@ CASES = {
     "unknown_clipped_film": Case(ToneCurve.FILM, Response.UNKNOWN, 1.6, gain=1.5 / _BRIGHT),
     "unknown_linear_jpeg": Case(ToneCurve.LINEAR, Response.UNKNOWN, 2.5, quality=92),
     "consumer": Case(ToneCurve.FILM, Response.UNKNOWN, 2.5, sharpening=0.5, quality=92),
+    "defocused": Case(ToneCurve.LINEAR, Response.LINEAR, 1.15, defocus_px=2.0),
+    "defocused_clipped": Case(
+        ToneCurve.LINEAR, Response.LINEAR, 1.6, gain=1.5 / _BRIGHT, defocus_px=2.0
+    ),
+    "defocused_consumer": Case(
+        ToneCurve.FILM, Response.UNKNOWN, 2.5, sharpening=0.5, quality=92, defocus_px=2.0
+    ),
+    "defocused_jpeg": Case(ToneCurve.LINEAR, Response.UNKNOWN, 2.5, quality=92, defocus_px=2.0),
+    "defocused_film": Case(ToneCurve.FILM, Response.UNKNOWN, 1.5, defocus_px=2.0),
 }
 
 
@@ -172,7 +188,7 @@ def measure(setup: Setup) -> Outcome:
     scenes, photos = [], []
     for _ in range(setup.photographs):
         scene = _scene(setup, pitch, fall, rng)
-        photo = photograph(camera, _POSE, scene, Optics(_PSF_PX), sensor, rng, case.gain)
+        photo = photograph(camera, _POSE, scene, case.optics, sensor, rng, case.gain)
         scenes.append(scene)
         photos.append(_compressed(photo, case.quality))
     outlines = [
@@ -288,7 +304,7 @@ def _bound_by_light(setup: Setup, sensor: Sensor, fall: float) -> Callable[[floa
         bound = centroid_bound(
             camera,
             scene,
-            Optics(_PSF_PX),
+            case.optics,
             replace(sensor, sharpening=0.0),
             case.gain,
             tone_is_unknown=case.response is Response.UNKNOWN,

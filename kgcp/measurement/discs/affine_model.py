@@ -22,11 +22,12 @@ from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.image_model.blur import REACH_SIGMAS, Blur
 from kgcp.measurement.image_model.blurred_discs import render
-from kgcp.measurement.image_model.blurred_plate import WhiteShare
+from kgcp.measurement.image_model.blurred_plate import KURTOSIS_SPREAD, WhiteShare
 from kgcp.measurement.image_model.quadrature import quadrature_for
 from kgcp.measurement.image_model.ray_plate import PLATE_ROWS, SLOPE_ROWS
 
 _VIEW_ROWS = 6
+_SHIFT_ROWS = 3  # the value, and its derivatives by a shift of the disc
 _SLACK_PX = 1.0  # what the edge may move before the pixels in reach are found anew
 _LEAST_SEMI_AXIS_PX = 0.4
 _FOURTH_CUMULANT_PX4 = -1.0 / 120.0  # of an even distribution over a pixel's width
@@ -51,6 +52,7 @@ class DiscPixels:
     circles: FloatArray  # (k + 1, 5): as `render` takes them
     starts: IndexArray  # (k + 2,): where the pixels begin that a circle reaches, …
     members: IndexArray  # … among these
+    kurtosis: float  # excess of the point spread's, beyond that of pixels
 
     @classmethod
     def of(
@@ -61,6 +63,7 @@ class DiscPixels:
         *,
         is_dark: bool,
         inner: FloatArray = NO_INNER,
+        kurtosis: float = 0.0,
     ) -> DiscPixels:
         """Find which pixels (2, n) feel an edge."""
         smallest, largest = semi_axes(geometry)
@@ -81,7 +84,7 @@ class DiscPixels:
         background[members] = 1.0 if is_dark else 0.0
         starts = len(members) * np.arange(len(circles) + 1)
         members = np.tile(members, len(circles))
-        return cls(places_px, is_dark, inner, background, circles, starts, members)
+        return cls(places_px, is_dark, inner, background, circles, starts, members, kurtosis)
 
     def white_share(self, geometry: Geometry, blur: Blur) -> WhiteShare:
         """Return the share of the brighter level in every pixel, with derivatives.
@@ -94,11 +97,27 @@ class DiscPixels:
         on_disc = np.zeros((PLATE_ROWS, views.shape[1]))
         on_disc[0] = self.background
         render(views, blur.vector, self.circles, self.starts, self.members, on_disc)
+        if self.kurtosis:
+            self._add_kurtosis(views, blur, on_disc)
         members = self.members[: self.starts[1]]  # the same for all circles
         _add_pixels_shape(views, inverse, blur.total_covariance, self.circles, members, on_disc)
         slopes = np.empty((SLOPE_ROWS, views.shape[1]))
         _carry_slopes(inverse, blur.vector, views, on_disc, slopes)
         return WhiteShare(views[:2], on_disc[0], slopes)
+
+    def _add_kurtosis(self, views: FloatArray, blur: Blur, on_disc: FloatArray) -> None:
+        """Add what the point spread's kurtosis makes of the edges, as `blurred_plate.kurtosis_row`.
+
+        Added are the value and its derivatives by a shift of the disc; those by the blur are left
+        out.
+        """
+        changed = np.zeros_like(on_disc)
+        for factor in (1.0 + KURTOSIS_SPREAD, 1.0 - KURTOSIS_SPREAD):
+            vector = blur.vector * np.array((factor, factor, factor, 1.0, 1.0))
+            render(views, vector, self.circles, self.starts, self.members, changed)
+        changed[0] += 2.0 * self.background
+        changed[:_SHIFT_ROWS] -= 2.0 * on_disc[:_SHIFT_ROWS]
+        on_disc[:_SHIFT_ROWS] += self.kurtosis / (6.0 * KURTOSIS_SPREAD**2) * changed[:_SHIFT_ROWS]
 
     def shares_within(self, geometry: Geometry, blur: Blur) -> FloatArray:
         """Return how much (k + 1, n) of every pixel each of a ring's circles covers."""

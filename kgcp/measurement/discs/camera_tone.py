@@ -73,8 +73,17 @@ _MORE_CONTRAST = np.array((0.0, -0.4, 0.0))
 # there on film's curve is learnt wrongly in half of the cases. In light that falls off by 5 % over
 # the radius, centres of dark discs of R 8 px are then off by 0.015 px, 1.5 to 2 stated deviations.
 _COARSE_STEP = 4.0
+# The excess kurtosis of the point spread is tried in such steps, from that of a Gaussian or from
+# one of a camera out of focus, whichever is likelier, over so many of them.
+_KURTOSIS_STEP, _DEFOCUSED_STEP, _MOST_KURTOSIS_STEPS = 0.2, -3.0, 3
+# Least gain of twice the log-likelihood by it, times the power of the excess above: of photographs
+# as they are, and of compressed ones. In focus, 65 to 100 discs have up to 3 of that, and in JPEGs
+# of unknown curves 11 to 126. Blurred to discs of 2 px radius, they have 500 and more by known
+# curves, 600 by film's in three of four cases, and 36 to 270 in JPEGs; 14 discs by unknown curves
+# have 23 and 30 (`benchmarks.calibrate.operator`).
+_WORTHY_KURTOSIS, _WORTHY_IN_COMPRESSED = 16.0, 100.0
 _LITTLE_BENT = 0.02  # standard deviation of the waves of a curve that is not bent
-_MEDIAN_SQUARE = {1: 0.455, 4: 3.357}  # of χ² with so many degrees of freedom
+_MEDIAN_SQUARE = {0: 1.0, 1: 0.455, 4: 3.357}  # of χ² with so many degrees of freedom
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,6 +94,7 @@ class CameraTone:
     sharpening_px: float = 0.0  # σ of its unsharp mask; 0: it does not sharpen
     known: ProcessingPrior | None = None
     blur_px: float = 0.0  # median of those that it was learned from; 0: none
+    kurtosis: float = 0.0  # excess of its point spread's
     is_reliable: bool = True  # or compression has left too little of the photographs to tell it
 
 
@@ -94,13 +104,16 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     An unknown curve is sRGB's or a straight line, whichever makes the same pixels of all discs
     together likelier. It is bent only if that makes them significantly likelier still: where white
     is burnt and black sunk, little of the curve is seen, and its bends explain what the model of
-    the image lacks. Then the width of the mask is adjusted, where the camera sharpens.
+    the image lacks. Then the width of the mask is adjusted, where the camera sharpens. Before all
+    that, the kurtosis of the point spread is found, of a camera that is out of focus.
     """
     tone = Tone.of(response)
-    if tone is Tone.LINEAR:
-        return CameraTone(tone)
     chosen = [task for tasks in photographs for task in _to_learn_from(tasks)]
-    fits = _first_fits(chosen, is_tone_stated=tone is Tone.SRGB)
+    fits = _first_fits(chosen, tone)
+    kurtosis = _learned_kurtosis(fits, tone)
+    if tone is Tone.LINEAR:
+        return CameraTone(tone, kurtosis=kurtosis)
+    fits = [_with_kurtosis(fit, kurtosis) for fit in fits]
     plain = _joints(fits, (tone,) if tone is Tone.SRGB else tuple(_BENT))
     bent = _joints(fits, tuple(_BENT.values())) if tone is Tone.UNKNOWN else []
     sds = [fit.sd for fit in fits]
@@ -111,7 +124,7 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
         ]
     )
     if best is None:
-        return CameraTone(tone, SHARPENING_PX)
+        return CameraTone(tone, SHARPENING_PX, kurtosis=kurtosis)
     base = _BENT.get(min(plain, key=lambda joint: joint.loss).tone) if plain else None
     start = next((joint for joint in bent if joint.tone is base), None)
     is_reliable = True
@@ -124,8 +137,8 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     if tone is Tone.UNKNOWN and not best.tone.is_shaped:
         # what an unknown curve may be off stays in the covariances
         known = _without_bends(known)
-        return CameraTone(_BENT[best.tone], best.sharpening_px, known, blur_px, is_reliable)
-    return CameraTone(best.tone, best.sharpening_px, known, blur_px, is_reliable)
+        best = replace(best, tone=_BENT[best.tone])
+    return CameraTone(best.tone, best.sharpening_px, known, blur_px, kurtosis, is_reliable)
 
 
 def unknowns_of_disc(task: DiscTask, camera: CameraTone) -> DiscUnknowns:
@@ -135,6 +148,7 @@ def unknowns_of_disc(task: DiscTask, camera: CameraTone) -> DiscUnknowns:
         camera.known,
         sharpening_px=camera.sharpening_px,
         has_ink_slope=not camera.tone.is_shaped and task.radius_px >= _LARGE_RADIUS_PX,
+        kurtosis=camera.kurtosis,
     )
 
 
@@ -159,15 +173,18 @@ def _to_learn_from(tasks: Sequence[DiscTask]) -> list[DiscTask]:
     return [large[i] for i in half[::step][:count]]
 
 
-def _first_fits(tasks: Sequence[DiscTask], *, is_tone_stated: bool) -> list[DiscFit]:
-    """Adjust discs each by itself, by sRGB's curve; those that lead anywhere.
+def _first_fits(tasks: Sequence[DiscTask], tone: Tone) -> list[DiscFit]:
+    """Adjust discs each by itself, by a known curve or by sRGB's; those that lead anywhere.
 
     Of burnt discs the upper end of the curve is not seen, and the edge of a shadow looks like one
     of its bends: without them, if enough are left. The light over a disc is taken to be linear:
     beside a second order of its own, held fast while all are adjusted together, the curve would be
     bent to fit it.
     """
-    free = DiscUnknowns.of(Tone.SRGB, sharpening_px=SHARPENING_PX, is_tone_stated=is_tone_stated)
+    free = DiscUnknowns.of(Tone.LINEAR)
+    if tone is not Tone.LINEAR:
+        is_stated = tone is Tone.SRGB
+        free = DiscUnknowns.of(Tone.SRGB, sharpening_px=SHARPENING_PX, is_tone_stated=is_stated)
     fits, clean = [], []
     for task in tasks:
         with contextlib.suppress(DiscRejection, NoFit, np.linalg.LinAlgError):
@@ -177,6 +194,40 @@ def _first_fits(tasks: Sequence[DiscTask], *, is_tone_stated: bool) -> list[Disc
             if not fit.sample.is_burnt and not is_in_curved_light(fit, task):
                 clean.append(fit)
     return clean if len(clean) >= min(_FEWEST_DISCS, len(fits) // 2) else fits
+
+
+def _learned_kurtosis(fits: Sequence[DiscFit], tone: Tone) -> float:
+    """Return the excess kurtosis of the point spread that makes discs together likeliest.
+
+    0, unless another one is significantly likelier: of a camera that is out of focus.
+    """
+    tones = tuple(_BENT.values()) if tone is Tone.UNKNOWN else (tone,)
+
+    def at(step: float, tones: Sequence[Tone]) -> JointFit | None:
+        changed = [_with_kurtosis(fit, step * _KURTOSIS_STEP) for fit in fits]
+        return _likeliest(_joints(changed, tones))
+
+    in_focus = at(0.0, tones)
+    if in_focus is None:
+        return 0.0
+    begin, first = 0.0, in_focus
+    defocused = at(_DEFOCUSED_STEP, tones)  # a wrong curve may make it likely to be in focus
+    if defocused is not None and defocused.loss < in_focus.loss:
+        begin, first = _DEFOCUSED_STEP, defocused
+    steps, best = _likeliest_along(
+        lambda steps: at(begin + steps, [first.tone]), first, _MOST_KURTOSIS_STEPS
+    )
+    gain = in_focus.loss - best.loss
+    is_compressed = any(steps is not None for steps in _steps_of(best.fits))
+    least = _WORTHY_IN_COMPRESSED if is_compressed else _WORTHY_KURTOSIS
+    is_worthy = 2.0 * gain > least * _excess(best) ** _BY_EXCESS
+    return (begin + steps) * _KURTOSIS_STEP if is_worthy else 0.0
+
+
+def _with_kurtosis(fit: DiscFit, kurtosis: float) -> DiscFit:
+    """Return a fit whose pixels are seen through a point spread of some kurtosis."""
+    pixels = replace(fit.sample.pixels, kurtosis=kurtosis)
+    return replace(fit, sample=replace(fit.sample, pixels=pixels))
 
 
 def _joints(fits: Sequence[DiscFit], tones: Sequence[Tone]) -> list[JointFit]:
@@ -223,6 +274,12 @@ def _from_first_fits(fits: Sequence[DiscFit], tone: Tone) -> JointFit | None:
     """Adjust discs with what they share, from fits by sRGB's curve; None if they cannot be."""
     if not fits:
         return None
+    if tone is Tone.LINEAR and not fits[0].free.sharpening_px:  # it is known to be linear
+        states, sds = [fit.state for fit in fits], [fit.sd for fit in fits]
+        try:
+            return adjust_together([fit.sample for fit in fits], states, tone, 0.0, sds)
+        except (NoFit, np.linalg.LinAlgError):
+            return None
     sharpening = float(np.median([fit.state.vector[Row.SHARPENING] for fit in fits]))
     states = [_state_by(fit, tone, sharpening) for fit in fits]
     return _adjusted_together(fits, states, tone, SHARPENING_PX, sds=[fit.sd for fit in fits])
@@ -270,8 +327,6 @@ def _samples_by(
 def _with_best_mask(joint: JointFit, adjusted: Callable[..., JointFit | None]) -> JointFit:
     """Return discs adjusted by the mask that makes them likeliest.
 
-    Its width is tried in steps, and a parabola through the last three gives the rest.
-
     Parameters
     ----------
     adjusted : callable
@@ -287,10 +342,28 @@ def _with_best_mask(joint: JointFit, adjusted: Callable[..., JointFit | None]) -
         return adjusted(joint.fits, states, joint.tone, _MASK_STEP**step * SHARPENING_PX)
 
     # anew, since the pixels beside the modelled ones are masked by what is known by now
-    tried = {0: at(0) or joint}
+    _, best = _likeliest_along(at, at(0) or joint, _MOST_STEPS)
+    return best
+
+
+def _likeliest_along(
+    at: Callable[[float], JointFit | None], first: JointFit, most_steps: int
+) -> tuple[float, JointFit]:
+    """Return the number of steps, and the fit there, that makes discs likeliest.
+
+    Steps are taken one by one, and a parabola through the last three gives the rest.
+
+    Parameters
+    ----------
+    at : callable
+        Returns the fit after so many steps, not always whole ones; None if there is none.
+    first : JointFit
+        That after 0 steps.
+    """
+    tried = {0: first}
     for direction in (1, -1):
         step = direction
-        while abs(step) <= _MOST_STEPS:
+        while abs(step) <= most_steps:
             other = at(step)
             if other is None:
                 break
@@ -302,11 +375,13 @@ def _with_best_mask(joint: JointFit, adjusted: Callable[..., JointFit | None]) -
             break
     best = min(tried, key=lambda step: tried[step].loss)
     if best - 1 not in tried or best + 1 not in tried:
-        return tried[best]
+        return best, tried[best]
     before, middle, after = (tried[best + k].loss for k in (-1, 0, 1))
     bend = before + after - 2.0 * middle
-    between = at(best + 0.5 * (before - after) / bend) if bend > 0.0 else None
-    return between if between is not None and between.loss < middle else tried[best]
+    least = best + 0.5 * (before - after) / bend if bend > 0.0 else float(best)
+    between = at(least)
+    is_less = between is not None and between.loss < middle
+    return (least, between) if between is not None and is_less else (best, tried[best])
 
 
 def _steps_of(fits: Sequence[DiscFit]) -> list[FloatArray | None]:

@@ -104,6 +104,7 @@ class DiscUnknowns:
     mean: FloatArray  # (21,)
     precision: FloatArray  # (21, 21); zeros: nothing is known
     is_tone_stated: bool  # or it is one to start from
+    kurtosis: float = 0.0  # excess of the point spread's, which is known
 
     @classmethod
     def of(
@@ -114,6 +115,7 @@ class DiscUnknowns:
         sharpening_px: float = 0.0,
         has_ink_slope: bool = False,
         is_tone_stated: bool = True,
+        kurtosis: float = 0.0,
     ) -> DiscUnknowns:
         """Return the unknowns of a disc.
 
@@ -127,6 +129,8 @@ class DiscUnknowns:
             Whether the darker level has a gradient of its own: large discs.
         is_tone_stated : bool
             Whether the tone is the camera's, or one to start from.
+        kurtosis : float
+            Excess of that of the camera's point spread.
         """
         rows = [*_ALWAYS, *_LIGHT]
         rows += _WAVES if tone.is_shaped else ()
@@ -143,7 +147,7 @@ class DiscUnknowns:
             mean[Row.WHITE], precision[Row.WHITE, Row.WHITE] = _WHITE, _WHITE_SD**-2
         is_fixed = ~np.isin(np.arange(COUNT), free)
         precision[is_fixed], precision[:, is_fixed] = 0.0, 0.0
-        return cls(tone, sharpening_px, free, mean, precision, is_tone_stated)
+        return cls(tone, sharpening_px, free, mean, precision, is_tone_stated, kurtosis)
 
     def without_ink_slope(self) -> DiscUnknowns:
         """Return the unknowns without a gradient of the darker level's own."""
@@ -291,7 +295,14 @@ class DiscSample:
     ) -> DiscSample:
         """Take pixels of a window, by their flat indices."""
         places = window.places_px(index)
-        pixels = DiscPixels.of(places, state.geometry, state.blur, is_dark=is_dark, inner=inner)
+        pixels = DiscPixels.of(
+            places,
+            state.geometry,
+            state.blur,
+            is_dark=is_dark,
+            inner=inner,
+            kurtosis=free.kurtosis,
+        )
         offsets = (places - state.geometry[:2, None]) / radius_px
         mask = None
         if free.sharpening_px:
@@ -337,6 +348,7 @@ def _mask(
         state.blur,
         is_dark=pixels.is_dark,
         inner=pixels.inner,
+        kurtosis=pixels.kurtosis,
     )
     share = whole.white_share(state.geometry, state.blur).value
     return unsharp_mask((window.height, window.width), index, share, sharpening_px)

@@ -22,7 +22,8 @@ from kgcp.measurement.image_model.ray_plate import (
     views_of,
 )
 
-_SPREAD = 0.3  # q below: larger ones reach beyond the pixels that feel an edge
+KURTOSIS_SPREAD = 0.3
+"""q of `kurtosis_row`; larger ones would reach beyond the pixels that feel an edge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,11 +90,11 @@ def kurtosis_row(
         By `white_share`; the other parameters are those it is made with.
     """
     changed = np.zeros(len(share))
-    for factor in (1.0 + _SPREAD, 1.0 - _SPREAD):
+    for factor in (1.0 + KURTOSIS_SPREAD, 1.0 - KURTOSIS_SPREAD):
         of_factor = blur.copy()
         of_factor[:3] *= factor
         changed += white_share_only(pose, rays, of_factor, incidence).value
-    return np.asarray((changed - 2.0 * share) / (6.0 * _SPREAD**2))
+    return np.asarray((changed - 2.0 * share) / (6.0 * KURTOSIS_SPREAD**2))
 
 
 def _rendered(
