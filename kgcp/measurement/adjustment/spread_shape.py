@@ -21,8 +21,10 @@ _KURTOSIS_SD = 0.5
 _SKEW_CHI2 = 25.0
 # χ² of one degree of freedom: 88 fits in focus and in even light have 10 at most, those of a coarse
 # renderer 27. Blurred to discs of 1 px radius by defocus, rings of R ≥ 19 px have 19 to 132; of
-# 1.5 px, rings of all sizes 19 and more.
+# 1.5 px, rings of all sizes 19 and more. By a curve that is not known, tone and sharpening stand in
+# for defocus of up to 2 px, and a kurtosis may stand in for the wrong base of the curve.
 _KURTOSIS_CHI2 = 16.0
+_KURTOSIS_CHI2_BY_UNKNOWN_TONE = 40.0
 KURTOSIS_CHI2_WITH_LEVELS = 40.0
 """χ² from which on kurtosis is free beside levels that vary.
 
@@ -51,7 +53,8 @@ def shape_needed(fit: TargetFit) -> list[int]:
     own = weighted @ by_shape.T - mixed.T @ np.linalg.solve(normal, mixed)
     if score[:-1] @ np.linalg.solve(own[:-1, :-1], score[:-1]) > _SKEW_CHI2:
         return SHAPE_PARAMS
-    return [int(Param.KURTOSIS)] if score[-1] ** 2 > _KURTOSIS_CHI2 * own[-1, -1] else []
+    least = _KURTOSIS_CHI2_BY_UNKNOWN_TONE if fit.sample.problem.tone.is_shaped else _KURTOSIS_CHI2
+    return [int(Param.KURTOSIS)] if score[-1] ** 2 > least * own[-1, -1] else []
 
 
 def _by_shape(fit: TargetFit) -> FloatArray:

@@ -199,11 +199,15 @@ def _first_fits(tasks: Sequence[DiscTask], tone: Tone) -> list[DiscFit]:
 def _learned_kurtosis(fits: Sequence[DiscFit], tone: Tone) -> float:
     """Return the excess kurtosis of the point spread that makes discs together likeliest.
 
-    0, unless another one is significantly likelier: of a camera that is out of focus.
+    0, unless one of a camera that is out of focus is significantly likelier. A positive one would
+    be that of a spread with long tails. Discs that another program rendered with jagged edges seem
+    to have 0.6, and with it, a focal length of 6673 px was off by 1.0 instead of 0.9 px.
     """
     tones = tuple(_BENT.values()) if tone is Tone.UNKNOWN else (tone,)
 
     def at(step: float, tones: Sequence[Tone]) -> JointFit | None:
+        if step > 0.0:
+            return None
         changed = [_with_kurtosis(fit, step * _KURTOSIS_STEP) for fit in fits]
         return _likeliest(_joints(changed, tones))
 

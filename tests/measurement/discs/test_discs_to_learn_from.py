@@ -12,6 +12,7 @@ from kgcp.measurement.discs import camera_tone
 from kgcp.measurement.discs.adjust_disc import DiscTask
 from kgcp.measurement.discs.fit_disc import DiscFit
 from kgcp.measurement.discs.outlines import find_outlines
+from kgcp.measurement.image_model.photometry import Tone
 
 
 def tasks(radius_px: float, count: int = 60) -> list[DiscTask]:
@@ -36,8 +37,8 @@ def test_small_discs_are_learned_from_in_number(
     """Of discs below 5 px nine, as of large ones: more of them do not tell tone from blur."""
     seen: list[int] = []
 
-    def first_fits(chosen: Sequence[DiscTask], *, is_tone_stated: bool) -> list[DiscFit]:
-        assert not is_tone_stated
+    def first_fits(chosen: Sequence[DiscTask], tone: Tone) -> list[DiscFit]:
+        assert tone is Tone.UNKNOWN
         seen.append(len(chosen))
         return []
 
