@@ -1,4 +1,4 @@
-"""The tone curve and the sharpening of a camera, learned from the largest discs of a photograph.
+"""Tone curve, sharpening and focus of a camera, learned from the largest discs of a photograph.
 
 A disc alone tells little of them, and takes errors of the curve for a displacement where the light
 falls off. All discs share them: some large ones are adjusted together, as one problem in which each
@@ -222,7 +222,7 @@ def _learned_kurtosis(fits: Sequence[DiscFit], tone: Tone) -> float:
         lambda steps: at(begin + steps, [first.tone]), first, _MOST_KURTOSIS_STEPS
     )
     gain = in_focus.loss - best.loss
-    is_compressed = any(steps is not None for steps in _steps_of(best.fits))
+    is_compressed = any(each is not None for each in _steps_of(best.fits))
     least = _WORTHY_IN_COMPRESSED if is_compressed else _WORTHY_KURTOSIS
     is_worthy = 2.0 * gain > least * _excess(best) ** _BY_EXCESS
     return (begin + steps) * _KURTOSIS_STEP if is_worthy else 0.0
@@ -382,10 +382,12 @@ def _likeliest_along(
         return best, tried[best]
     before, middle, after = (tried[best + k].loss for k in (-1, 0, 1))
     bend = before + after - 2.0 * middle
-    least = best + 0.5 * (before - after) / bend if bend > 0.0 else float(best)
-    between = at(least)
-    is_less = between is not None and between.loss < middle
-    return (least, between) if between is not None and is_less else (best, tried[best])
+    if bend > 0.0:
+        least = best + 0.5 * (before - after) / bend
+        between = at(least)
+        if between is not None and between.loss < middle:
+            return least, between
+    return best, tried[best]
 
 
 def _steps_of(fits: Sequence[DiscFit]) -> list[FloatArray | None]:
