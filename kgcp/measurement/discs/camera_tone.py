@@ -110,12 +110,14 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     tone = Tone.of(response)
     chosen = [task for tasks in photographs for task in _to_learn_from(tasks)]
     fits = _first_fits(chosen, tone)
-    kurtosis = _learned_kurtosis(fits, tone)
+    plain, bent = _by_curves(fits, tone)
+    in_focus = _likeliest(bent or plain)
+    kurtosis = 0.0 if in_focus is None else _learned_kurtosis(fits, in_focus)
     if tone is Tone.LINEAR:
         return CameraTone(tone, kurtosis=kurtosis)
-    fits = [_with_kurtosis(fit, kurtosis) for fit in fits]
-    plain = _joints(fits, (tone,) if tone is Tone.SRGB else tuple(_BENT))
-    bent = _joints(fits, tuple(_BENT.values())) if tone is Tone.UNKNOWN else []
+    if kurtosis:
+        fits = [_with_kurtosis(fit, kurtosis) for fit in fits]
+        plain, bent = _by_curves(fits, tone)
     sds = [fit.sd for fit in fits]
     best = _likeliest(
         [
@@ -196,31 +198,37 @@ def _first_fits(tasks: Sequence[DiscTask], tone: Tone) -> list[DiscFit]:
     return clean if len(clean) >= min(_FEWEST_DISCS, len(fits) // 2) else fits
 
 
-def _learned_kurtosis(fits: Sequence[DiscFit], tone: Tone) -> float:
+def _by_curves(fits: Sequence[DiscFit], tone: Tone) -> tuple[list[JointFit], list[JointFit]]:
+    """Return discs adjusted together by plain curves that may be the camera's, and by bent ones."""
+    if tone is not Tone.UNKNOWN:
+        return _joints(fits, (tone,)), []
+    return _joints(fits, tuple(_BENT)), _joints(fits, tuple(_BENT.values()))
+
+
+def _learned_kurtosis(fits: Sequence[DiscFit], in_focus: JointFit) -> float:
     """Return the excess kurtosis of the point spread that makes discs together likeliest.
 
     0, unless one of a camera that is out of focus is significantly likelier. A positive one would
     be that of a spread with long tails. Discs that another program rendered with jagged edges seem
     to have 0.6, and with it, a focal length of 6673 px was off by 1.0 instead of 0.9 px.
-    """
-    tones = tuple(_BENT.values()) if tone is Tone.UNKNOWN else (tone,)
 
-    def at(step: float, tones: Sequence[Tone]) -> JointFit | None:
+    Parameters
+    ----------
+    in_focus : JointFit
+        Those of the fits without kurtosis, by the likeliest curve.
+    """
+
+    def at(step: float) -> JointFit | None:
         if step > 0.0:
             return None
         changed = [_with_kurtosis(fit, step * _KURTOSIS_STEP) for fit in fits]
-        return _likeliest(_joints(changed, tones))
+        return _from_first_fits(changed, in_focus.tone)
 
-    in_focus = at(0.0, tones)
-    if in_focus is None:
-        return 0.0
     begin, first = 0.0, in_focus
-    defocused = at(_DEFOCUSED_STEP, tones)  # a wrong curve may make it likely to be in focus
+    defocused = at(_DEFOCUSED_STEP)  # a wrong curve may make it likely to be in focus
     if defocused is not None and defocused.loss < in_focus.loss:
         begin, first = _DEFOCUSED_STEP, defocused
-    steps, best = _likeliest_along(
-        lambda steps: at(begin + steps, [first.tone]), first, _MOST_KURTOSIS_STEPS
-    )
+    steps, best = _likeliest_along(lambda steps: at(begin + steps), first, _MOST_KURTOSIS_STEPS)
     gain = in_focus.loss - best.loss
     is_compressed = any(each is not None for each in _steps_of(best.fits))
     least = _WORTHY_IN_COMPRESSED if is_compressed else _WORTHY_KURTOSIS
