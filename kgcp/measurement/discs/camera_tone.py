@@ -78,12 +78,13 @@ _COARSE_STEP = 4.0
 _KURTOSIS_STEP, _DEFOCUSED_STEP, _MOST_KURTOSIS_STEPS = 0.2, -3.0, 3
 # Least gain of twice the log-likelihood by it, times the power of the excess above: of photographs
 # as they are, and of compressed ones. In focus, 65 to 100 discs have up to 3 of that, and in JPEGs
-# of unknown curves 11 to 126. Blurred to discs of 2 px radius, they have 500 and more by known
-# curves, 600 by film's in three of four cases, and 36 to 270 in JPEGs; 14 discs by unknown curves
+# of unknown curves up to 126. Blurred to discs of 2 px radius, they have 500 and more by known
+# curves, 600 by film's in three of four cases, and up to 270 in JPEGs; 14 discs by unknown curves
 # have 23 and 30 (`benchmarks.calibrate.operator`).
 _WORTHY_KURTOSIS, _WORTHY_IN_COMPRESSED = 16.0, 100.0
 _LITTLE_BENT = 0.02  # standard deviation of the waves of a curve that is not bent
-_MEDIAN_SQUARE = {0: 1.0, 1: 0.455, 4: 3.357}  # of χ² with so many degrees of freedom
+# Of χ² with so many degrees of freedom; with none, discs share nothing to contradict each other in.
+_MEDIAN_SQUARE = {0: 1.0, 1: 0.455, 4: 3.357}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,8 +105,9 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     An unknown curve is sRGB's or a straight line, whichever makes the same pixels of all discs
     together likelier. It is bent only if that makes them significantly likelier still: where white
     is burnt and black sunk, little of the curve is seen, and its bends explain what the model of
-    the image lacks. Then the width of the mask is adjusted, where the camera sharpens. Before all
-    that, the kurtosis of the point spread is found, of a camera that is out of focus.
+    the image lacks. Then the width of the mask is adjusted, where the camera sharpens. If the curve
+    that is likeliest so far says that the camera is out of focus, all are compared once more with
+    the kurtosis of such a point spread.
     """
     tone = Tone.of(response)
     chosen = [task for tasks in photographs for task in _to_learn_from(tasks)]
@@ -283,18 +285,13 @@ def _without_bends(known: ProcessingPrior) -> ProcessingPrior:
 
 
 def _from_first_fits(fits: Sequence[DiscFit], tone: Tone) -> JointFit | None:
-    """Adjust discs with what they share, from fits by sRGB's curve; None if they cannot be."""
+    """Adjust discs with what they share, from first fits; None if they cannot be."""
     if not fits:
         return None
-    if tone is Tone.LINEAR and not fits[0].free.sharpening_px:  # it is known to be linear
-        states, sds = [fit.state for fit in fits], [fit.sd for fit in fits]
-        try:
-            return adjust_together([fit.sample for fit in fits], states, tone, 0.0, sds)
-        except (NoFit, np.linalg.LinAlgError):
-            return None
     sharpening = float(np.median([fit.state.vector[Row.SHARPENING] for fit in fits]))
     states = [_state_by(fit, tone, sharpening) for fit in fits]
-    return _adjusted_together(fits, states, tone, SHARPENING_PX, sds=[fit.sd for fit in fits])
+    sharpening_px, sds = fits[0].free.sharpening_px, [fit.sd for fit in fits]
+    return _adjusted_together(fits, states, tone, sharpening_px, sds=sds)
 
 
 def _adjusted_together(
@@ -463,11 +460,11 @@ def _is_bent(joint: JointFit) -> bool:
 
 
 def _state_by(fit: DiscFit, tone: Tone, sharpening: float) -> DiscState:
-    """Return the state of a fit by sRGB's curve, for another tone curve with the same levels."""
+    """Return the state of a first fit, for another tone curve with the same levels."""
     vector = fit.state.vector.copy()
     vector[Row.SHARPENING] = sharpening
     if not tone.is_srgb:
-        vector[[Row.BLACK, Row.WHITE]] = fit.state.plateaus(Tone.SRGB)
+        vector[[Row.BLACK, Row.WHITE]] = fit.state.plateaus(fit.free.tone)
     return DiscState(vector)
 
 

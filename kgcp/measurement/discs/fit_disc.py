@@ -330,7 +330,9 @@ class DiscSample:
 
     def by(self, tone: Tone, sharpening_px: float, state: DiscState) -> DiscSample:
         """Return the same pixels for another tone curve and another mask of the camera's."""
-        mask = _mask(self.window, self.index, state, sharpening_px, self.pixels)
+        mask = None
+        if sharpening_px:
+            mask = _mask(self.window, self.index, state, sharpening_px, self.pixels)
         return replace(self, level_model=replace(self.level_model, tone=tone, mask=mask))
 
 

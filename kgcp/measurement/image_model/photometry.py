@@ -155,7 +155,7 @@ _FILTERED = [Param.BLACK, Param.WHITE, *range(9)]
 _TONE_ROWS = [Param.TONE_1, Param.TONE_2, Param.TONE_3]
 _LEVEL_ROWS = [Param.BLACK, Param.WHITE, *_TONE_ROWS]
 SKEW_PARAMS = [int(Param.SKEW_XXX), int(Param.SKEW_XXY), int(Param.SKEW_XYY), int(Param.SKEW_YYY)]
-SHAPE_PARAMS = [*SKEW_PARAMS, int(Param.KURTOSIS)]
+SHAPE_PARAMS = [*SKEW_PARAMS, int(Param.KURTOSIS)]  # what makes a point spread no Gaussian
 _RARE_ROWS = np.array([Param.STREAK_X, Param.STREAK_Y, *SHAPE_PARAMS])
 _SHARE_STEPS = 400
 GEOMETRY_ROWS = 11  # of pose and blur, without the shape of the point spread
@@ -269,8 +269,8 @@ class PhotometricModel:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the grey values (n,) and their Jacobian; `added` as in `levels`.
 
-        It has 21 rows, or 26 where the point spread has a shape. Where the light is uneven it has
-        28, the last two by what is added to ink and to plate.
+        It has 21 rows, or 26 where the point spread is skew or has a kurtosis. Where the light is
+        uneven it has 28, the last two by what is added to ink and to plate.
         """
         value = np.empty(len(share.value))
         has_shape = len(share.jacobian) > GEOMETRY_ROWS
