@@ -267,7 +267,7 @@ def _with_seen_levels(problem: FitProblem, poses: TwoPoses, plateaus: Plateaus) 
     first = poses.best.parameters
     plateaus = look_at_plateaus(problem, first.pose, first.blur.mean_sd_px) or plateaus
     black, white = decoded(np.array(plateaus.extremes), problem.tone).tolist()
-    light = _of_levels(first.light, black, white)
+    light = Light(black, white)  # no tone curve: that of the evened image is another one
     field = field_of(even_field(problem), problem, plateaus, light)
     smooth = replace(Parameters.of(first.pose, first.blur, light), field=field)
     return _fitted(problem, poses, [*_shadow_across(problem, first, plateaus), smooth])
@@ -275,22 +275,15 @@ def _with_seen_levels(problem: FitProblem, poses: TwoPoses, plateaus: Plateaus) 
 
 def _shadow_across(problem: FitProblem, first: Parameters, plateaus: Plateaus) -> list[Parameters]:
     """Return the start with a shadow's straight edge across the plate, if there may be one."""
-    edge = step_across(problem, plateaus)
-    if edge is None:
+    step = step_across(problem, plateaus)
+    if step is None:
         return []
-    if edge[4] > 0.0:  # beyond is the shade: the tone curve is that of the lit side
-        edge = np.array((edge[0] + math.pi, -edge[1], edge[2], -edge[3], -edge[4]))
-    lit, shaded = (
-        decoded(np.array(plateaus.typical) + half * edge[3:], problem.tone) for half in (-0.5, 0.5)
-    )
-    light = _of_levels(first.light, float(lit[0]), float(lit[1]))
-    edge[3:] = (shaded - lit) / (light.white - light.black)
+    lit, shaded = (decoded(levels, problem.tone) for levels in (step.lit, step.shaded))
+    light = Light(float(lit[0]), float(lit[1]))
+    darker = (shaded - lit) / (light.white - light.black)
+    edge = np.array((step.angle, step.offset_px, math.log(step.width_px), *darker))
     edged = Parameters.of(first.pose, first.blur, light)
     return [replace(edged, field=replace(even_field(problem), edges=edge[None]))]
-
-
-def _of_levels(light: Light, black: float, white: float) -> Light:
-    return replace(_in_even_light(light), black=black, white=white)
 
 
 def _in_even_light(light: Light) -> Light:

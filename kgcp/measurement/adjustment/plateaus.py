@@ -12,7 +12,7 @@ from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.problem import FitProblem
-from kgcp.measurement.image_model.light_field import INK, PLATE, LightField
+from kgcp.measurement.image_model.light_field import LightField
 from kgcp.measurement.image_model.photometry import Light, decoded
 from kgcp.measurement.image_model.unblurred import UnblurredPlate, unblurred_plate
 
@@ -175,10 +175,21 @@ def field_of(
     return replace(field, values=values, offsets=offsets)
 
 
-def step_across(problem: FitProblem, plateaus: Plateaus) -> FloatArray | None:
+@dataclass(frozen=True, slots=True, eq=False)
+class ShadowStep:
+    """A straight edge of a shadow, with the grey values of ink and plate on either side."""
+
+    angle: float  # of its normal, towards the shade [rad]
+    offset_px: float  # along that, from the target's centre
+    width_px: float  # σ of its penumbra
+    lit: FloatArray  # (2,)
+    shaded: FloatArray  # (2,)
+
+
+def step_across(problem: FitProblem, plateaus: Plateaus) -> ShadowStep | None:
     """Return the straight edge that explains most of how the levels vary; None if that is little.
 
-    As in `LightField.edges` (5,), but with grey values for the levels of ink and plate.
+    Levels of either side are means: it may have any share of the plate.
     """
     window = problem.window
     step = max(1, sum(map(len, plateaus.flat)) // _MOST_PIXELS)
@@ -189,23 +200,29 @@ def step_across(problem: FitProblem, plateaus: Plateaus) -> FloatArray | None:
     whole = sum(float(np.var(v)) * len(v) / n for v, n in zip(values, noise, strict=True))
     radius_px = _REACH * problem.outer_radius_px
     bins = np.linspace(-radius_px, radius_px, _OFFSETS)
-    best, edge = 0.0, None
+    width_px = max(1.0, _FIRST_WIDTH * radius_px)
+    best, found = 0.0, None
     for angle in math.pi * np.arange(_TURNS) / _TURNS:
-        gain, rises = np.zeros(_OFFSETS - 2), np.empty((2, _OFFSETS - 2))
+        gain, sides = np.zeros(_OFFSETS - 2), np.empty((2, 2, _OFFSETS - 2))
         for k in (0, 1):
             sums = np.zeros((2, len(bins) - 1))
             _sum_across(offsets[k], values[k], math.cos(angle), math.sin(angle), radius_px, sums)
-            rises[k], explained = _steps(*sums)
+            sides[:, k], explained = _steps(*sums)
             gain += explained / noise[k]
         place = int(gain.argmax())
         if gain[place] > best:
             best = float(gain[place])
-            width_px = max(1.0, _FIRST_WIDTH * radius_px)
-            edge = np.array((angle, bins[place + 1], math.log(width_px), *rises[:, place]))
-    if edge is None or best < _STEP_GAIN * whole:
+            before, beyond = sides[:, :, place]
+            found = ShadowStep(float(angle), float(bins[place + 1]), width_px, before, beyond)
+    if found is None or best < _STEP_GAIN * whole:
         return None
-    by_ink = edge[INK] / edge[PLATE] if edge[PLATE] else math.inf
-    return edge if _LEAST_BY_INK < by_ink < _MOST_BY_INK else None
+    by_ink, by_plate = (found.shaded - found.lit).tolist()
+    if not by_plate or not _LEAST_BY_INK < by_ink / by_plate < _MOST_BY_INK:
+        return None
+    if by_plate > 0.0:
+        turned = found.angle + math.pi, -found.offset_px
+        found = ShadowStep(*turned, width_px, found.shaded, found.lit)
+    return found
 
 
 @compiled
@@ -232,13 +249,15 @@ def _sum_across(
 
 
 def _steps(count: FloatArray, total: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the step of the mean at every inner border of bins, and what it explains.
+    """Return the means (2, b - 1) before and beyond every inner border, and what steps explain.
 
-    Of each bin (b,), the number of values and their sum are given.
+    Of each bin (b,), the number of values and their sum are given. Where a side has few values,
+    both means are that of all.
     """
     below, sum_below = np.cumsum(count)[:-1], np.cumsum(total)[:-1]
     above, sum_above = count.sum() - below, total.sum() - sum_below
     usable = np.minimum(below, above) >= _FEWEST_PIXELS
-    rise = sum_above / np.maximum(above, 1) - sum_below / np.maximum(below, 1)
-    rise = np.where(usable, rise, 0.0)
-    return rise, np.asarray(rise**2 * below * above / max(count.sum(), 1))
+    sides = np.stack((sum_below / np.maximum(below, 1), sum_above / np.maximum(above, 1)))
+    sides[:, ~usable] = total.sum() / max(count.sum(), 1)
+    explained = (sides[1] - sides[0]) ** 2 * below * above / max(count.sum(), 1)
+    return sides, np.asarray(explained)

@@ -14,7 +14,6 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.plateaus import Plateaus, look_at_plateaus, step_across
 from kgcp.measurement.adjustment.problem import FitProblem
-from kgcp.measurement.image_model.light_field import ANGLE, OFFSET, PLATE
 from kgcp.targets.layout import Target
 
 CENTRE_PX, LEFT, OFF_PX = (205.4, 190.7), 0.5, 12.0
@@ -68,16 +67,37 @@ def test_where_no_ink_or_plate_is_seen_the_levels_are_those_of_what_is_farther_o
     assert np.abs(plateaus.levels - typical[:, None]).max() < 0.05
 
 
+@pytest.mark.parametrize("way", [WAY, WAY + math.pi], ids=["beyond", "before"])
+@pytest.mark.parametrize("off_px", [OFF_PX, 45.0], ids=["half", "a little"])
 def test_a_shadow_s_edge_is_found_where_it_lies(
+    look: Callable[..., tuple[FitProblem, Plateaus]], target: Target, off_px: float, way: float
+) -> None:
+    """Levels are those of either side, whatever share of the plate is in shade."""
+    sign = round(math.cos(way - WAY))
+    problem, plateaus = look(target, lambda along: np.where(sign * along > off_px, LEFT, 1.0))
+    assert plateaus.is_uneven
+    step = step_across(problem, plateaus)
+    assert step is not None
+    turn = (step.angle - way + math.pi) % (2.0 * math.pi) - math.pi
+    assert turn == pytest.approx(0.0, abs=math.radians(8.0))
+    assert step.offset_px == pytest.approx(off_px, abs=4.0)
+    assert step.lit == pytest.approx((0.08, 0.75), abs=0.015)
+    assert step.shaded == pytest.approx((0.08 * LEFT, 0.75 * LEFT), abs=0.04)
+
+
+def test_a_step_that_only_plate_shows_leaves_ink_as_it_is(
     look: Callable[..., tuple[FitProblem, Plateaus]], target: Target
 ) -> None:
-    problem, plateaus = look(target, lambda along: np.where(along > OFF_PX, LEFT, 1.0))
-    assert plateaus.is_uneven
-    edge = step_across(problem, plateaus)
-    assert edge is not None
-    assert edge[ANGLE] == pytest.approx(WAY, abs=math.radians(8.0))
-    assert edge[OFFSET] == pytest.approx(OFF_PX, abs=4.0)
-    assert edge[PLATE] == pytest.approx(-0.75 * (1.0 - LEFT), rel=0.1)
+    problem, plateaus = look(target, lambda along: np.where(along > 56.0, LEFT, 1.0))
+    ink, plate = plateaus.flat
+    along = (problem.window.pixels(ink) - problem.centre_px[:, None]).T @ (
+        math.cos(WAY),
+        math.sin(WAY),
+    )
+    step = step_across(problem, replace(plateaus, flat=(ink[along < 52.0], plate)))
+    assert step is not None
+    assert [step.lit[0], step.shaded[0]] == pytest.approx([0.08, 0.08], abs=0.01)
+    assert step.lit[1] - step.shaded[1] == pytest.approx(0.75 * (1.0 - LEFT), rel=0.15)
 
 
 @pytest.mark.parametrize(
