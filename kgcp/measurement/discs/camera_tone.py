@@ -223,9 +223,10 @@ def _learned_kurtosis(fits: Sequence[DiscFit], in_focus: JointFit) -> float:
     def at(step: float) -> JointFit | None:
         if step > 0.0:
             return None
-        changed = [_with_kurtosis(fit, step * _KURTOSIS_STEP) for fit in fits]
-        return _from_first_fits(changed, in_focus.tone)
+        changed = [_with_kurtosis(fit, step * _KURTOSIS_STEP) for fit in in_focus.fits]
+        return _adjusted_together(changed, states, in_focus.tone, in_focus.sharpening_px, sds=sds)
 
+    states, sds = [fit.state for fit in in_focus.fits], [fit.sd for fit in fits]
     begin, first = 0.0, in_focus
     defocused = at(_DEFOCUSED_STEP)  # a wrong curve may make it likely to be in focus
     if defocused is not None and defocused.loss < in_focus.loss:

@@ -124,8 +124,9 @@ def test_what_is_usual_of_burnt_white_does_not_bend_the_curve(seed: int) -> None
     assert learned.known.mean[:3] == pytest.approx((0.0, -0.7, 0.0), abs=0.1)
 
 
-@pytest.mark.parametrize("seed", [0, 100, 101])
-@pytest.mark.parametrize("levels", [(0.1, 0.62), (0.62, 0.1)])
+@pytest.mark.parametrize(
+    ("levels", "seed"), [((0.1, 0.62), 0), ((0.62, 0.1), 100), ((0.1, 0.62), 101)]
+)
 def test_noise_does_not_bend_a_straight_line(levels: tuple[float, float], seed: int) -> None:
     """Sharpened or not; of small discs, a curve that is bent by chance makes them 1 % larger."""
     tasks = small_discs(Sensor(sharpening=0.5 * (seed > 0)), levels, 0.0, seed)
