@@ -212,6 +212,8 @@ def minimised(
         while True:
             damped = unit + damping * np.eye(len(unit))
             step = scaled @ np.linalg.solve(damped, scaled.T @ right)
+            if float(step @ right) <= _CONVERGED:  # no step gains more
+                return pose
             trial = pose.moved(step)
             trial_normal, trial_right, trial_cost = _normal_equations(
                 camera, kept, trial, weight, sd_focal
