@@ -13,7 +13,7 @@ import click
 import cv2
 import numpy as np
 
-from benchmarks.accuracy.small_rings import errors_of, settings_of
+from benchmarks.accuracy.ring_sizes import errors_of, settings_of
 from kgcp.simulation.light_settings import Shadow
 
 _LINES = (("clean", 0.5), ("clean", 0.35), ("clean", 0.25), ("consumer", 0.3))
@@ -31,7 +31,8 @@ def main(frames: int, seed: int) -> None:
         shadow = Shadow(light_left=light_left, edges=1, stripes=0)
         settings = settings_of(camera, "even", frames)
         settings = replace(settings, distance_m=_DISTANCE_M, shadow=shadow)
-        relative, distance, centre = errors_of(settings, seed)
+        errors = errors_of(settings, seed)
+        relative, distance, centre = errors.relative, errors.distance, errors.centre
         if not len(relative):
             print(f"{camera:10s}{light_left:10.2f}{0:10d}", flush=True)
             continue

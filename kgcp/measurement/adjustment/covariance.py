@@ -53,7 +53,7 @@ _EDGE_FLOOR_PX, _EDGE_FLOOR_OF_BINS_PX = 0.0005, 0.004
 _PER_SHARPENING_PX = 0.005
 # Variance on small rings, relative to what residuals show of uneven light: where levels vary; and
 # up to so much where they do not, as residuals do not say enough of them
-# (`benchmarks.accuracy.small_rings`, without these factors: z of 1.4 in shade and 1.5 with dirt).
+# (`benchmarks.accuracy.ring_sizes`, without these factors: z of 1.4 in shade and 1.5 with dirt).
 _ON_SMALL_RINGS, _ON_EVEN_SMALL_RINGS = 1.8, 1.4
 # Of what a skew spread displaces: beyond its third moment nothing is known. Of 139 plates behind
 # four comatic lenses, centres are off by 0.09 to 0.20 of it per axis (RMS), behind another

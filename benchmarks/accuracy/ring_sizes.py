@@ -1,0 +1,173 @@
+"""Rings of one size at a time, in even and uneven light.
+
+Usage: python -m benchmarks.accuracy.ring_sizes [--size small] [--frames 60] [--jobs 2]
+
+Small rings have radii of 7 to 13 px and show little of ink and plate beside their edges; middle
+ones have 37 to 140 px; large ones have 150 to 290 px and are seen in bins, or in some of their
+pixels. Each line is a camera of a preset of `kgcp simulate` and a kind of light: how many of the
+targets are measured, the RMS error of the distance, its mean and RMS standardised, how many are off
+by more than three standard deviations, the RMS standardised error of the centre, and the median
+CPU time of a frame.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from functools import cache, partial
+
+import click
+import cv2
+import numpy as np
+
+from benchmarks.pool import ordered_map
+from kgcp.geometry.arrays import FloatArray
+from kgcp.measurement.frame import examine
+from kgcp.measurement.records import Measurement
+from kgcp.pipeline.execution.resilient_map import usable_cores
+from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.settings import DetectSettings
+from kgcp.simulation.flight import (
+    TARGET_PLATE,
+    FlightPlan,
+    grow_ground,
+    plan_flight,
+    render_frame,
+)
+from kgcp.simulation.ground import Ground
+from kgcp.simulation.light_settings import Dirt, Glare, Shadow
+from kgcp.simulation.presets import SimulationSettings, preset
+
+_CAMERAS = ("clean", "consumer")
+_LIGHTS: dict[str, dict[str, object]] = {
+    "even": {},
+    "half in shade": {"shadow": Shadow(light_left=0.5, edges=1, stripes=0)},
+    "antenna's shadow": {"shadow": Shadow(light_left=0.6, edges=0, stripes=1)},
+    "dirt": {"dirt": Dirt()},
+    "highlights": {"glare": Glare()},
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """How large rings are."""
+
+    distance_m: tuple[float, float]
+    frame_px: tuple[int, int]
+    principal_point_px: tuple[float, float]
+
+
+SIZES = {
+    "small": Size((80.0, 150.0), (560, 420), (281.3, 207.2)),
+    "middle": Size((7.0, 30.0), (720, 540), (362.6, 266.4)),
+    "large": Size((3.5, 7.0), (1120, 840), (562.6, 414.4)),
+}
+
+
+def settings_of(
+    camera: str, light: str, frames: int, size: Size = SIZES["small"]
+) -> SimulationSettings:
+    """Return a flight of frames that are not much larger than the target in each of them."""
+    chosen = preset(camera)
+    (width, height), (cx, cy) = size.frame_px, size.principal_point_px
+    return replace(
+        chosen,
+        frames=frames,
+        absent_share=0.0,
+        decoy_share=0.0,
+        distance_m=size.distance_m,
+        camera=replace(chosen.camera, width=width, height=height, cx=cx, cy=cy),
+        **_LIGHTS[light],  # type: ignore[arg-type] # of the settings' own names
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RingErrors:
+    """Errors of the targets that are measured (n,), and what a frame costs."""
+
+    relative: FloatArray  # of the distance
+    distance: FloatArray  # the same, in standard deviations
+    centre: FloatArray  # per axis, in standard deviations
+    seconds: float  # CPU time of a frame, median
+
+
+@dataclass(frozen=True, slots=True)
+class _Flight:
+    """What a process needs to render the frames of a flight."""
+
+    settings: SimulationSettings
+    seed: int
+
+
+@cache
+def _planned(flight: _Flight) -> tuple[FlightPlan, Ground]:
+    return plan_flight(flight.settings, flight.seed), grow_ground(flight.seed)
+
+
+def _errors_in_frame(flight: _Flight, index: int) -> tuple[list[FloatArray], float]:
+    """Return relative and standardised errors (3,) of each measured target, and the CPU time."""
+    plan, ground = _planned(flight)
+    frame, camera = plan.frames[index], flight.settings.camera
+    grey = render_frame(plan, ground, index)
+    with single_threaded():
+        begin_s = time.process_time()
+        seen = examine(grey, camera, (TARGET_PLATE.target,), DetectSettings())
+        seconds = time.process_time() - begin_s
+    errors = []
+    for found in seen.outcomes:
+        if not isinstance(found, Measurement) or found.uncertainty is None:
+            continue
+        error_m = found.distance_m - frame.target.distance_m
+        off_px = found.centre_px - camera.project(frame.target.translation_m[None])[0]
+        squares = off_px @ np.linalg.solve(found.uncertainty.centre_cov_px2, off_px)
+        relative = error_m / frame.target.distance_m
+        errors.append(np.array((relative, error_m / found.sd_distance_m, np.sqrt(0.5 * squares))))
+    return errors, seconds
+
+
+def errors_of(settings: SimulationSettings, seed: int, jobs: int = 1) -> RingErrors:
+    """Return the errors in a flight whose frames are not compressed."""
+    flight = _Flight(settings, seed)
+    found = list(
+        ordered_map(
+            partial(_errors_in_frame, flight),
+            range(settings.frames),
+            jobs=jobs,
+            start=cv2.setNumThreads,
+            start_arguments=(0,),
+        )
+    )
+    errors = np.array([each for of_frame, _ in found for each in of_frame]).reshape(-1, 3)
+    relative, distance, centre = errors.T
+    seconds = float(np.median([each for _, each in found]))
+    return RingErrors(relative, distance, centre, seconds)
+
+
+@click.command()
+@click.option("--size", type=click.Choice(list(SIZES)), default="small", show_default=True)
+@click.option("--frames", type=click.IntRange(2), default=60, show_default=True, help="Per line.")
+@click.option("--seed", type=click.IntRange(0), default=77, show_default=True)
+@click.option("--jobs", type=click.IntRange(1, 256), default=None)
+def main(size: str, frames: int, seed: int, jobs: int | None) -> None:
+    """Print the table."""
+    print("camera    light             found  error [%]  z mean   z RMS  > 3  z of centre  ms")
+    for camera in _CAMERAS:
+        for light in _LIGHTS:
+            errors = errors_of(
+                settings_of(camera, light, frames, SIZES[size]), seed, jobs or usable_cores()
+            )
+            z = errors.distance
+            print(
+                f"{camera:10s}{light:18s}{len(z):5d}{100.0 * _rms(errors.relative):11.4f}"
+                f"{z.mean():8.2f}{_rms(z):8.2f}{np.count_nonzero(np.abs(z) > 3.0):5d}"
+                f"{_rms(errors.centre):13.2f}{1e3 * errors.seconds:5.0f}",
+                flush=True,
+            )
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+if __name__ == "__main__":
+    main()
