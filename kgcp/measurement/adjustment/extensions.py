@@ -174,7 +174,7 @@ def _fit_in_any_light(
         raise UnevenLightInBins
     plateaus = find_plateaus()
     if plateaus is None or not plateaus.is_uneven:
-        varying = _with_levels(problem, plain)
+        varying = _with_levels(problem, plain, plateaus)
     else:
         varying = _in_seen_light(problem, pose, blur, plateaus)
     return plain if _may_be_even(plain.best, varying.best) else varying
@@ -193,9 +193,7 @@ def _may_be_even(plain: TargetFit, varying: TargetFit) -> bool:
 def _in_seen_light(problem: FitProblem, pose: Pose, blur: Blur, plateaus: Plateaus) -> TwoPoses:
     """Adjust both poses with levels that vary from those that are seen on ink and plate."""
     poses = fit_both_poses(evened_window(problem, plateaus), pose, blur)
-    return _with_kurtosis(
-        problem, _with_shape(problem, _with_seen_levels(problem, poses, plateaus))
-    )
+    return _with_kurtosis(problem, _with_shape(problem, _with_levels(problem, poses, plateaus)))
 
 
 def _with_shape(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
@@ -253,21 +251,19 @@ def _fit_shaped(
     return TwoPoses(shaped, fit_at(shaped, other))
 
 
-def _with_levels(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
-    """Let nearly even levels vary: start from the plain fit, and from a shadow's edge."""
-    plain = poses.best.parameters
-    first = Parameters.of(plain.pose, plain.blur, _in_even_light(plain.light))
-    plateaus = look_at_plateaus(problem, first.pose, first.blur.mean_sd_px)
-    shadows = [] if plateaus is None else _shadow_across(problem, first, plateaus)
-    return _fitted(problem, poses, [*shadows, first])
+def _with_levels(problem: FitProblem, poses: TwoPoses, plateaus: Plateaus | None) -> TwoPoses:
+    """Let the levels vary: start from those seen on ink and plate, and from a shadow's edge.
 
-
-def _with_seen_levels(problem: FitProblem, poses: TwoPoses, plateaus: Plateaus) -> TwoPoses:
-    """Let the levels vary: start from those seen on ink and plate, and from a shadow's edge."""
+    No tone curve is taken over: that of an evened image is another one, and in burnt images a plain
+    fit's has a white that is far too bright.
+    """
     first = poses.best.parameters
     plateaus = look_at_plateaus(problem, first.pose, first.blur.mean_sd_px) or plateaus
+    if plateaus is None:
+        light = _in_even_light(first.light)
+        return _fitted(problem, poses, [Parameters.of(first.pose, first.blur, light)])
     black, white = decoded(np.array(plateaus.extremes), problem.tone).tolist()
-    light = Light(black, white)  # no tone curve: that of the evened image is another one
+    light = Light(black, white)
     field = field_of(even_field(problem), problem, plateaus, light)
     smooth = replace(Parameters.of(first.pose, first.blur, light), field=field)
     return _fitted(problem, poses, [*_shadow_across(problem, first, plateaus), smooth])
