@@ -174,7 +174,9 @@ def _fit_in_any_light(
         raise UnevenLightInBins
     plateaus = find_plateaus()
     if plateaus is None or not plateaus.is_uneven:
-        varying = _with_levels(problem, plain, plateaus)
+        # what displaces the edges of bins goes with the levels that it was fitted with
+        seen = None if problem.tone is Tone.OF_BINS else plateaus
+        varying = _with_levels(problem, plain, seen)
     else:
         varying = _in_seen_light(problem, pose, blur, plateaus)
     return plain if _may_be_even(plain.best, varying.best) else varying
@@ -255,13 +257,13 @@ def _with_levels(problem: FitProblem, poses: TwoPoses, plateaus: Plateaus | None
     """Let the levels vary: start from those seen on ink and plate, and from a shadow's edge.
 
     No tone curve is taken over: that of an evened image is another one, and in burnt images a plain
-    fit's has a white that is far too bright.
+    fit's has a white that is far too bright. Without plateaus the start is even light.
     """
     first = poses.best.parameters
-    plateaus = look_at_plateaus(problem, first.pose, first.blur.mean_sd_px) or plateaus
     if plateaus is None:
         light = _in_even_light(first.light)
         return _fitted(problem, poses, [Parameters.of(first.pose, first.blur, light)])
+    plateaus = look_at_plateaus(problem, first.pose, first.blur.mean_sd_px) or plateaus
     black, white = decoded(np.array(plateaus.extremes), problem.tone).tolist()
     light = Light(black, white)
     field = field_of(even_field(problem), problem, plateaus, light)

@@ -106,7 +106,7 @@ def test_cells_ask_for_levels_and_edges_where_cells_leave_a_doubt(
 def test_small_rings_are_in_even_light_where_levels_explain_little_more(
     monkeypatch: pytest.MonkeyPatch, *, radius_px: float, advantage: float, is_even: bool
 ) -> None:
-    problem = stand_in(outer_radius_px=radius_px, may_be_finer=False)
+    problem = stand_in(outer_radius_px=radius_px, may_be_finer=False, tone=Tone.LINEAR)
     plain, varying = (stand_in(best=stand_in(sample=stand_in(problem=problem))) for _ in range(2))
     monkeypatch.setattr(extensions, "fit_both_poses", lambda *_: plain)
     monkeypatch.setattr(extensions, "_with_shape", lambda _, poses: poses)
@@ -116,3 +116,27 @@ def test_small_rings_are_in_even_light_where_levels_explain_little_more(
     pose = Pose(np.eye(3), np.array([0.0, 0.0, 9.0]))
     chosen = extensions._fit_in_any_light(problem, pose, Blur(0.5, 0.5, 0.0), lambda: None)
     assert chosen is (plain if is_even else varying)
+
+
+@pytest.mark.parametrize(
+    ("tone", "starts_from_seen"), [(Tone.UNKNOWN, True), (Tone.OF_BINS, False)]
+)
+def test_bins_in_nearly_even_light_keep_the_levels_that_they_were_fitted_with(
+    monkeypatch: pytest.MonkeyPatch, *, tone: Tone, starts_from_seen: bool
+) -> None:
+    problem = stand_in(outer_radius_px=200.0, may_be_finer=False, tone=tone)
+    plain = stand_in(best=stand_in(sample=stand_in(problem=problem)))
+    seen, started_from = stand_in(is_uneven=False), []
+
+    def with_levels(_: object, poses: object, plateaus: object) -> object:
+        started_from.append(plateaus)
+        return poses
+
+    monkeypatch.setattr(extensions, "fit_both_poses", lambda *_: plain)
+    monkeypatch.setattr(extensions, "_with_shape", lambda _, poses: poses)
+    monkeypatch.setattr(extensions, "needs_varying_levels", lambda _: True)
+    monkeypatch.setattr(extensions, "_with_levels", with_levels)
+    monkeypatch.setattr(extensions, "_may_be_even", lambda *_: True)
+    pose = Pose(np.eye(3), np.array([0.0, 0.0, 9.0]))
+    extensions._fit_in_any_light(problem, pose, Blur(0.5, 0.5, 0.0), lambda: seen)
+    assert started_from == [seen if starts_from_seen else None]

