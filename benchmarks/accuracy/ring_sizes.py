@@ -34,7 +34,6 @@ from kgcp.simulation.flight import (
     plan_flight,
     render_frame,
 )
-from kgcp.simulation.ground import Ground
 from kgcp.simulation.light_settings import Dirt, Glare, Shadow
 from kgcp.simulation.presets import SimulationSettings, preset
 
@@ -91,24 +90,13 @@ class RingErrors:
     seconds: float  # CPU time of a frame, median
 
 
-@dataclass(frozen=True, slots=True)
-class _Flight:
-    """What a process needs to render the frames of a flight."""
-
-    settings: SimulationSettings
-    seed: int
+_ground_of = cache(grow_ground)  # once per process
 
 
-@cache
-def _planned(flight: _Flight) -> tuple[FlightPlan, Ground]:
-    return plan_flight(flight.settings, flight.seed), grow_ground(flight.seed)
-
-
-def _errors_in_frame(flight: _Flight, index: int) -> tuple[list[FloatArray], float]:
+def _errors_in_frame(plan: FlightPlan, index: int) -> tuple[list[FloatArray], float]:
     """Return relative and standardised errors (3,) of each measured target, and the CPU time."""
-    plan, ground = _planned(flight)
-    frame, camera = plan.frames[index], flight.settings.camera
-    grey = render_frame(plan, ground, index)
+    frame, camera = plan.frames[index], plan.settings.camera
+    grey = render_frame(plan, _ground_of(plan.seed), index)
     with single_threaded():
         begin_s = time.process_time()
         seen = examine(grey, camera, (TARGET_PLATE.target,), DetectSettings())
@@ -127,10 +115,9 @@ def _errors_in_frame(flight: _Flight, index: int) -> tuple[list[FloatArray], flo
 
 def errors_of(settings: SimulationSettings, seed: int, jobs: int = 1) -> RingErrors:
     """Return the errors in a flight whose frames are not compressed."""
-    flight = _Flight(settings, seed)
     found = list(
         ordered_map(
-            partial(_errors_in_frame, flight),
+            partial(_errors_in_frame, plan_flight(settings, seed)),
             range(settings.frames),
             jobs=jobs,
             start=cv2.setNumThreads,

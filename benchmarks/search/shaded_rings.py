@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import click
-import cv2
 import numpy as np
 
 from benchmarks.accuracy.ring_sizes import errors_of, settings_of
@@ -25,7 +24,6 @@ _DISTANCE_M = (30.0, 140.0)
 @click.option("--seed", type=click.IntRange(0), default=5, show_default=True)
 def main(frames: int, seed: int) -> None:
     """Print the table."""
-    cv2.setNumThreads(0)
     print("camera    light left  measured  error, median and RMS [%]  z of distance, centre  > 3")
     for camera, light_left in _LINES:
         shadow = Shadow(light_left=light_left, edges=1, stripes=0)

@@ -174,7 +174,7 @@ def _fit_in_any_light(
         raise UnevenLightInBins
     plateaus = find_plateaus()
     if plateaus is None or not plateaus.is_uneven:
-        # what displaces the edges of bins goes with the levels that it was fitted with
+        # the one tone parameter of bins holds only for the levels that it was fitted with
         seen = None if problem.tone is Tone.OF_BINS else plateaus
         varying = _with_levels(problem, plain, seen)
     else:
@@ -261,7 +261,8 @@ def _with_levels(problem: FitProblem, poses: TwoPoses, plateaus: Plateaus | None
     """
     first = poses.best.parameters
     if plateaus is None:
-        light = _in_even_light(first.light)
+        # without what levels that vary replace
+        light = replace(first.light, slope_x=0.0, slope_y=0.0, curvature=0.0, linear_sharpening=0.0)
         return _fitted(problem, poses, [Parameters.of(first.pose, first.blur, light)])
     plateaus = look_at_plateaus(problem, first.pose, first.blur.mean_sd_px) or plateaus
     black, white = decoded(np.array(plateaus.extremes), problem.tone).tolist()
@@ -282,11 +283,6 @@ def _shadow_across(problem: FitProblem, first: Parameters, plateaus: Plateaus) -
     edge = np.array((step.angle, step.offset_px, math.log(step.width_px), *darker))
     edged = Parameters.of(first.pose, first.blur, light)
     return [replace(edged, field=replace(even_field(problem), edges=edge[None]))]
-
-
-def _in_even_light(light: Light) -> Light:
-    """Return ink, plate and the tone curve without the other unknowns of even light."""
-    return replace(light, slope_x=0.0, slope_y=0.0, curvature=0.0, linear_sharpening=0.0)
 
 
 def _fitted(problem: FitProblem, poses: TwoPoses, starts: list[Parameters]) -> TwoPoses:

@@ -200,8 +200,7 @@ def step_across(problem: FitProblem, plateaus: Plateaus) -> ShadowStep | None:
     whole = sum(float(np.var(v)) * len(v) / n for v, n in zip(values, noise, strict=True))
     radius_px = _REACH * problem.outer_radius_px
     bins = np.linspace(-radius_px, radius_px, _OFFSETS)
-    width_px = max(1.0, _FIRST_WIDTH * radius_px)
-    best, found = 0.0, None
+    best, edge = 0.0, None
     for angle in math.pi * np.arange(_TURNS) / _TURNS:
         gain, sides = np.zeros(_OFFSETS - 2), np.empty((2, 2, _OFFSETS - 2))
         for k in (0, 1):
@@ -212,17 +211,17 @@ def step_across(problem: FitProblem, plateaus: Plateaus) -> ShadowStep | None:
         place = int(gain.argmax())
         if gain[place] > best:
             best = float(gain[place])
-            before, beyond = sides[:, :, place]
-            found = ShadowStep(float(angle), float(bins[place + 1]), width_px, before, beyond)
-    if found is None or best < _STEP_GAIN * whole:
+            edge = float(angle), float(bins[place + 1]), *sides[:, :, place]
+    if edge is None or best < _STEP_GAIN * whole:
         return None
-    by_ink, by_plate = (found.shaded - found.lit).tolist()
+    angle, offset_px, before, beyond = edge
+    by_ink, by_plate = (beyond - before).tolist()
     if not by_plate or not _LEAST_BY_INK < by_ink / by_plate < _MOST_BY_INK:
         return None
-    if by_plate > 0.0:
-        turned = found.angle + math.pi, -found.offset_px
-        found = ShadowStep(*turned, width_px, found.shaded, found.lit)
-    return found
+    width_px = max(1.0, _FIRST_WIDTH * radius_px)
+    if by_plate > 0.0:  # the shade lies the other way
+        return ShadowStep(angle + math.pi, -offset_px, width_px, lit=beyond, shaded=before)
+    return ShadowStep(angle, offset_px, width_px, lit=before, shaded=beyond)
 
 
 @compiled

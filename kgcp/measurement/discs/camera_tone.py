@@ -114,13 +114,13 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     fits = _first_fits(chosen, tone)
     plain, bent = _by_curves(fits, tone)
     in_focus = _likeliest(bent or plain)
-    kurtosis = 0.0 if in_focus is None else _learned_kurtosis(fits, in_focus)
+    sds = [fit.sd for fit in fits]  # the same for all that is compared
+    kurtosis = 0.0 if in_focus is None else _learned_kurtosis(in_focus, sds)
     if tone is Tone.LINEAR:
         return CameraTone(tone, kurtosis=kurtosis)
     if kurtosis:
         fits = [_with_kurtosis(fit, kurtosis) for fit in fits]
         plain, bent = _by_curves(fits, tone)
-    sds = [fit.sd for fit in fits]
     best = _likeliest(
         [
             _with_best_mask(joint, partial(_adjusted_together, sds=sds))
@@ -207,7 +207,7 @@ def _by_curves(fits: Sequence[DiscFit], tone: Tone) -> tuple[list[JointFit], lis
     return _joints(fits, tuple(_BENT)), _joints(fits, tuple(_BENT.values()))
 
 
-def _learned_kurtosis(fits: Sequence[DiscFit], in_focus: JointFit) -> float:
+def _learned_kurtosis(in_focus: JointFit, sds: Sequence[FloatArray]) -> float:
     """Return the excess kurtosis of the point spread that makes discs together likeliest.
 
     0, unless one of a camera that is out of focus is significantly likelier. A positive one would
@@ -217,7 +217,9 @@ def _learned_kurtosis(fits: Sequence[DiscFit], in_focus: JointFit) -> float:
     Parameters
     ----------
     in_focus : JointFit
-        Those of the fits without kurtosis, by the likeliest curve.
+        Discs without kurtosis, by the likeliest curve.
+    sds : sequence of (n,) arrays
+        As for `adjust_together`.
     """
 
     def at(step: float) -> JointFit | None:
@@ -226,7 +228,7 @@ def _learned_kurtosis(fits: Sequence[DiscFit], in_focus: JointFit) -> float:
         changed = [_with_kurtosis(fit, step * _KURTOSIS_STEP) for fit in in_focus.fits]
         return _adjusted_together(changed, states, in_focus.tone, in_focus.sharpening_px, sds=sds)
 
-    states, sds = [fit.state for fit in in_focus.fits], [fit.sd for fit in fits]
+    states = [fit.state for fit in in_focus.fits]
     begin, first = 0.0, in_focus
     defocused = at(_DEFOCUSED_STEP)  # a wrong curve may make it likely to be in focus
     if defocused is not None and defocused.loss < in_focus.loss:

@@ -23,7 +23,7 @@ MOST_STEPS = 40
 """Of an adjustment."""
 
 _CONVERGED = 1e-5  # decrease of χ² that means nothing
-_NOTHING = 1e-9  # that rounding may hide
+_HIDDEN_BY_ROUNDING = 1e-9  # … and one that need not be tried
 _ENDS_SD, _LEAST_RISE = 3.0, 0.5  # where a bend ends, and how much of χ² must rise until there
 _NO_DISTANCE = 1e6  # deviation of the logarithm of a distance that is not measured
 _DOUBTED_CHI2 = 9.0  # of a point that counts half for what all points have in common
@@ -213,7 +213,7 @@ def minimised(
         while True:
             damped = unit + damping * np.eye(len(unit))
             step = scaled @ np.linalg.solve(damped, scaled.T @ right)
-            if float(step @ right) <= _NOTHING:  # no step gains more
+            if float(step @ right) <= _HIDDEN_BY_ROUNDING:  # no step gains more
                 return pose
             trial = pose.moved(step)
             trial_normal, trial_right, trial_cost = _normal_equations(
