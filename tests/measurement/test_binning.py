@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -124,6 +125,21 @@ def test_large_rings_half_in_shade_are_measured_as_well_as_in_even_light(
     for turn in (0.4, 2.1, 3.9):
         shot = half_in_shade(response, turn, rng)
         found = shot.measured()
+        assert found.uncertainty is not None
+        off = found.pose.distance_m / shot.pose.distance_m - 1.0
+        sd = found.uncertainty.sd_distance_m / shot.pose.distance_m
+        assert sd < 3e-5
+        assert abs(off) < 3.5 * sd
+
+
+def test_compression_of_large_rings_is_not_taken_for_uneven_light() -> None:
+    """Bins in which levels vary have deviations of 0.004 to 0.011 % there."""
+    rng = np.random.default_rng(8)
+    for _ in range(4):
+        shot = shoot(Response.UNKNOWN, 1.1, rng)
+        _, jpeg = cv2.imencode(".jpg", shot.grey, (cv2.IMWRITE_JPEG_QUALITY, 90))
+        decoded = cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)
+        found = replace(shot, grey=decoded).measured()
         assert found.uncertainty is not None
         off = found.pose.distance_m / shot.pose.distance_m - 1.0
         sd = found.uncertainty.sd_distance_m / shot.pose.distance_m

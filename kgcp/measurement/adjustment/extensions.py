@@ -33,7 +33,6 @@ from kgcp.measurement.adjustment.random_levels import (
     chi2_with_levels,
     even_field,
     fit_levels,
-    is_beyond_bins,
     needs_varying_levels,
 )
 from kgcp.measurement.adjustment.solver import TargetFit, adjust
@@ -61,7 +60,7 @@ _LEAST_ADVANTAGE_IN_SMALL_RING = 25.0
 
 
 class UnevenLightInBins(Exception):  # noqa: N818 - the outcome of one fit
-    """The light is too uneven for bins: smaller ones are to be adjusted, or single pixels."""
+    """The light on bins seems uneven: smaller ones are to be adjusted, or single pixels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,7 +169,7 @@ def _fit_in_any_light(
         return _in_seen_light(problem, pose, blur, plateaus)
     if not needs_varying_levels(plain.best):
         return plain
-    if is_beyond_bins(plain.best):
+    if problem.may_be_finer:
         raise UnevenLightInBins
     plateaus = find_plateaus()
     if plateaus is None or not plateaus.is_uneven:

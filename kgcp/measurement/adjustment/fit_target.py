@@ -49,9 +49,10 @@ _LARGEST_RADIUS_PX = 150.0  # enough for the last digit that calibrations can te
 # All that bins know of a tone curve or of clipping is how far they displace edges, which in uneven
 # light is not the same everywhere. Distances of 30 simulated rings of R 150 to 275 px half in
 # shade, with dirt, or under highlights were off by up to 0.03 %. So many single pixels, spread over
-# them, leave up to 0.0045 %, and take 0.1 to 1.2 s. Still larger rings are seen in bins again,
-# which bounds the memory.
-_MOST_PIXELS, _LARGEST_UNEVEN_PX = 6000, 300.0
+# them, leave up to 0.0045 %, and take 0.1 to 1.2 s. Compression, too, makes bins seem to be in
+# uneven light: 20 of 40 rings of R 150 to 450 px in JPEGs. Still larger rings are seen in bins
+# again, which bounds the memory.
+_MOST_PIXELS, _LARGEST_UNEVEN_PX = 6000, 450.0
 _DOUBTFUL_SIDE = 10.0  # Δχ² of the other pose below which more than this frame is asked
 _NOTHING_KNOWN = PlatePrior()
 # Enlargement of the covariance by residuals that agree, where levels vary: of 480 simulated plates

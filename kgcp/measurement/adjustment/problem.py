@@ -44,7 +44,7 @@ class FitProblem:
     # everywhere, as far as the search knows
     visible: BoolArray | None = None
     most_pixels: int | None = None  # that take part; None: all that are useful
-    # whether light that is too uneven for its bins is to end in `UnevenLightInBins`
+    # whether bins that need levels that vary are to end in `UnevenLightInBins`
     may_be_finer: bool = False
 
     @property

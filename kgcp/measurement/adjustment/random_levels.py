@@ -88,7 +88,7 @@ _LEAST_CONTRAST = 0.05
 # Mean square of the residuals' sums over cells, relative to that of independent residuals. Above
 # this, the levels vary; frames in even light have about 1. Bins have little noise: 19 rings of R
 # 150 to 310 px in even light had 0.9 to 5.6, and 30 in uneven light 6.4 (one) and 25 to 60.
-_UNEVEN_EXCESS, _UNEVEN_EXCESS_OF_BINS, _BEYOND_BINS = 1.9, 3.0, 6.0
+_UNEVEN_EXCESS, _UNEVEN_EXCESS_OF_BINS = 1.9, 3.0
 # In small rings, cells say less than edges do. An excess that leaves a doubt is enough if residuals
 # that agree along edges inflate the covariance so much: of 58 frames with dirt, one of R 15 px had
 # an excess of 1.3, an inflation of 6.5, and an error of 4.6 σ without levels that vary. In even
@@ -140,11 +140,6 @@ def needs_varying_levels(fit: TargetFit) -> bool:
     is_small = fit.sample.problem.outer_radius_px < SMALL_RING_PX
     doubtful, inflation = _DOUBTFUL_IN_SMALL_RING if is_small else _DOUBTFUL
     return excess > doubtful and not is_binned and pose_covariance(fit).inflation > inflation
-
-
-def is_beyond_bins(fit: TargetFit) -> bool:
-    """Tell whether the light is too uneven for bins, of which there may be smaller ones."""
-    return fit.sample.problem.may_be_finer and excess_of_cells(fit) > _BEYOND_BINS
 
 
 def fit_levels(
