@@ -1,13 +1,13 @@
 """Rings of one size at a time, in even and uneven light.
 
-Usage: python -m benchmarks.accuracy.ring_sizes [--size small] [--frames 60] [--jobs 2]
+Usage: python -m benchmarks.accuracy.ring_sizes [--size small] [--frames 60] [--quality 85]
 
 Small rings have radii of 7 to 13 px and show little of ink and plate beside their edges; middle
 ones have 37 to 140 px; large ones have 150 to 290 px and are seen in bins, or in some of their
 pixels. Each line is a camera of a preset of `kgcp simulate` and a kind of light: how many of the
 targets are measured, the RMS error of the distance, its mean and RMS standardised, how many are off
 by more than three standard deviations, the RMS standardised error of the centre, and the median
-CPU time of a frame.
+CPU time of a frame. Frames are not compressed, or by JPEG of that quality.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from kgcp.measurement.frame import examine
 from kgcp.measurement.records import Measurement
 from kgcp.pipeline.execution.resilient_map import usable_cores
 from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.pipeline.simulate import encode_image
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import (
     TARGET_PLATE,
@@ -40,6 +41,7 @@ from kgcp.simulation.presets import SimulationSettings, preset
 _CAMERAS = ("clean", "consumer")
 _LIGHTS: dict[str, dict[str, object]] = {
     "even": {},
+    "burnt": {"gain": (1.15, 2.2)},
     "half in shade": {"shadow": Shadow(light_left=0.5, edges=1, stripes=0)},
     "antenna's shadow": {"shadow": Shadow(light_left=0.6, edges=0, stripes=1)},
     "dirt": {"dirt": Dirt()},
@@ -64,7 +66,7 @@ SIZES = {
 
 
 def settings_of(
-    camera: str, light: str, frames: int, size: Size = SIZES["small"]
+    camera: str, light: str, frames: int, size: Size = SIZES["small"], quality: int | None = None
 ) -> SimulationSettings:
     """Return a flight of frames that are not much larger than the target in each of them."""
     chosen = preset(camera)
@@ -75,6 +77,7 @@ def settings_of(
         absent_share=0.0,
         decoy_share=0.0,
         distance_m=size.distance_m,
+        jpeg_quality=quality,
         camera=replace(chosen.camera, width=width, height=height, cx=cx, cy=cy),
         **_LIGHTS[light],  # type: ignore[arg-type] # of the settings' own names
     )
@@ -97,6 +100,9 @@ def _errors_in_frame(plan: FlightPlan, index: int) -> tuple[list[FloatArray], fl
     """Return relative and standardised errors (3,) of each measured target, and the CPU time."""
     frame, camera = plan.frames[index], plan.settings.camera
     grey = render_frame(plan, _ground_of(plan.seed), index)
+    if plan.settings.jpeg_quality is not None:
+        jpeg = np.frombuffer(encode_image(grey, plan.settings.jpeg_quality), np.uint8)
+        grey = np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE))
     with single_threaded():
         begin_s = time.process_time()
         seen = examine(grey, camera, (TARGET_PLATE.target,), DetectSettings())
@@ -114,7 +120,7 @@ def _errors_in_frame(plan: FlightPlan, index: int) -> tuple[list[FloatArray], fl
 
 
 def errors_of(settings: SimulationSettings, seed: int, jobs: int = 1) -> RingErrors:
-    """Return the errors in a flight whose frames are not compressed."""
+    """Return the errors in a flight."""
     found = list(
         ordered_map(
             partial(_errors_in_frame, plan_flight(settings, seed)),
@@ -133,15 +139,18 @@ def errors_of(settings: SimulationSettings, seed: int, jobs: int = 1) -> RingErr
 @click.command()
 @click.option("--size", type=click.Choice(list(SIZES)), default="small", show_default=True)
 @click.option("--frames", type=click.IntRange(2), default=60, show_default=True, help="Per line.")
+@click.option("--quality", type=click.IntRange(1, 100), default=None, help="Of JPEG.")
 @click.option("--seed", type=click.IntRange(0), default=77, show_default=True)
 @click.option("--jobs", type=click.IntRange(1, 256), default=None)
-def main(size: str, frames: int, seed: int, jobs: int | None) -> None:
+def main(size: str, frames: int, quality: int | None, seed: int, jobs: int | None) -> None:
     """Print the table."""
     print("camera    light             found  error [%]  z mean   z RMS  > 3  z of centre  ms")
     for camera in _CAMERAS:
         for light in _LIGHTS:
             errors = errors_of(
-                settings_of(camera, light, frames, SIZES[size]), seed, jobs or usable_cores()
+                settings_of(camera, light, frames, SIZES[size], quality),
+                seed,
+                jobs or usable_cores(),
             )
             z = errors.distance
             print(

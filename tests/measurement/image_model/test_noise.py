@@ -225,21 +225,23 @@ def test_twelve_bits_in_a_file_of_sixteen_clip_where_values_pile_up() -> None:
     assert clip.high == pytest.approx(full * count, abs=count)
 
 
+@pytest.mark.parametrize("flat", [0, 20_000])
 @pytest.mark.parametrize("burnt", [True, False])
 def test_what_compression_makes_of_clipped_levels_says_no_more_than_they(
-    burnt: bool,  # noqa: FBT001 - a case
+    *, burnt: bool, flat: int
 ) -> None:
-    """At either end of the range, with grey values of edges all over it."""
+    """At either end of the range, with grey values of edges all over it; in small and large."""
     rng = np.random.default_rng(4)
     smeared = np.clip(np.rint(rng.normal(255.0, 2.0, 800)), 0.0, 255.0)
     edges, other = rng.integers(0, 256, 500), np.rint(rng.normal(90.0, 3.0, 800))
-    counts = np.concatenate((smeared, edges, other))
+    counts = np.concatenate((smeared, edges, other, np.full(flat, 255.0)))
     clip = find_censoring((counts if burnt else 255.0 - counts) * COUNT, COUNT)
     at_end, high = (clip.at_high, clip.high) if burnt else (clip.at_low, 1.0 - clip.low)
     assert 247.0 < high / COUNT < 251.0
     assert at_end[:800].mean() > 0.97
     assert at_end[800:1300].mean() < 0.04
-    assert not at_end[1300:].any()
+    assert not at_end[1300:2100].any()
+    assert at_end[2100:].all()
 
 
 def test_levels_that_are_clipped_at_once_are_not_smeared() -> None:

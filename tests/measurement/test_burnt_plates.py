@@ -1,0 +1,57 @@
+"""Plates that are burnt white in compressed frames: errors and deviations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.fit_target import measure_by_model
+from kgcp.measurement.records import InitialPose
+from kgcp.simulation.flight import TARGET_PLATE
+from kgcp.simulation.imaging import Sensor, ToneCurve
+
+LENS = Camera(420, 340, 900.0, 901.0, 208.2, 171.7)
+
+
+@pytest.mark.parametrize(
+    ("response", "tone"),
+    [(Response.LINEAR, ToneCurve.LINEAR), (Response.SRGB, ToneCurve.SRGB)],
+)
+@pytest.mark.parametrize(("radius_px", "percent"), [(60.0, 0.02), (110.0, 0.01)])
+def test_compressed_burnt_plates_are_measured_as_well_as_others(
+    photograph: Callable[..., GreyArray],
+    start_near: Callable[..., InitialPose],
+    *,
+    response: Response,
+    tone: ToneCurve,
+    radius_px: float,
+    percent: float,
+) -> None:
+    """Taken for exact, the grey values beside clipped ones put large rings off by 0.1 to 0.8 %."""
+    camera, sensor, standardised = replace(LENS, response=response), Sensor(tone=tone), []
+    for seed in range(3):
+        rng = np.random.default_rng(40 + seed)
+        ray = np.append(camera.undistort(np.array([210.3, 170.6])), 1.0)
+        rotation = Rotation.from_rotvec(np.radians([*rng.uniform(-12.0, 12.0, 2), 71.0]))
+        pose = Pose(rotation.as_matrix(), ray * 0.45 * camera.mean_focal_px / radius_px)
+        grey = photograph(camera, pose, rng, sensor=sensor, gain=2.0)
+        _, jpeg = cv2.imencode(".jpg", grey, (cv2.IMWRITE_JPEG_QUALITY, 82))
+        seen = measure_by_model(
+            cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE),
+            camera,
+            TARGET_PLATE.target,
+            start_near(camera, pose, rng),
+        )
+        assert seen.uncertainty is not None
+        off_m = seen.pose.distance_m - pose.distance_m
+        assert abs(off_m) < 0.01 * percent * pose.distance_m
+        standardised.append(off_m / seen.uncertainty.sd_distance_m)
+    assert np.abs(standardised).max() < 3.5
