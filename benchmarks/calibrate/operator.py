@@ -72,6 +72,10 @@ CASES = {
     "unknown_clipped": Case(ToneCurve.LINEAR, Response.UNKNOWN, 1.6, gain=1.5 / _BRIGHT),
     "unknown_clipped_film": Case(ToneCurve.FILM, Response.UNKNOWN, 1.6, gain=1.5 / _BRIGHT),
     "unknown_linear_jpeg": Case(ToneCurve.LINEAR, Response.UNKNOWN, 2.5, quality=92),
+    "clipped_jpeg": Case(ToneCurve.LINEAR, Response.LINEAR, 2.5, gain=1.5 / _BRIGHT, quality=92),
+    "unknown_clipped_jpeg": Case(
+        ToneCurve.FILM, Response.UNKNOWN, 2.5, gain=1.5 / _BRIGHT, quality=92
+    ),
     "consumer": Case(ToneCurve.FILM, Response.UNKNOWN, 2.5, sharpening=0.5, quality=92),
     "defocused": Case(ToneCurve.LINEAR, Response.LINEAR, 1.15, defocus_px=2.0),
     "defocused_clipped": Case(

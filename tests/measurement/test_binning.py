@@ -138,7 +138,7 @@ def test_compression_of_large_rings_is_not_taken_for_uneven_light() -> None:
     for _ in range(4):
         shot = shoot(Response.UNKNOWN, 1.1, rng)
         _, jpeg = cv2.imencode(".jpg", shot.grey, (cv2.IMWRITE_JPEG_QUALITY, 90))
-        decoded = cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)
+        decoded = np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE))
         found = replace(shot, grey=decoded).measured()
         assert found.uncertainty is not None
         off = found.pose.distance_m / shot.pose.distance_m - 1.0

@@ -45,7 +45,7 @@ def test_compressed_burnt_plates_are_measured_as_well_as_others(
         grey = photograph(camera, pose, rng, sensor=sensor, gain=2.0)
         _, jpeg = cv2.imencode(".jpg", grey, (cv2.IMWRITE_JPEG_QUALITY, 82))
         seen = measure_by_model(
-            cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE),
+            np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)),
             camera,
             TARGET_PLATE.target,
             start_near(camera, pose, rng),

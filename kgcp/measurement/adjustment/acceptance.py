@@ -12,7 +12,7 @@ from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.measurement.adjustment.problem import SMALL_RING_PX
 from kgcp.measurement.adjustment.solver import TargetFit
-from kgcp.measurement.image_model.noise import median_at_edges
+from kgcp.measurement.image_model.noise import median_at_edges, outlier_share
 from kgcp.measurement.image_model.photometry import plateau_levels
 from kgcp.measurement.records import Measurement
 from kgcp.targets.layout import Ring
@@ -43,8 +43,7 @@ def check_fit(fit: TargetFit) -> None:
     Rejection
         `POOR_FIT`.
     """
-    seen = ~fit.sample.censoring.is_clipped
-    outlying = float(np.mean(fit.misfit.weight[seen] < 0.5))
+    outlying = outlier_share(fit.misfit, fit.prediction.levels, fit.sample.censoring)
     noise = edge_noise(fit)
     if outlying > _MAX_OUTLIERS or noise > _MAX_EDGE_NOISE:
         raise Rejection(

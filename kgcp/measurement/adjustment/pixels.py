@@ -146,7 +146,7 @@ def _sample(
         levels=window.levels[index],
         rays=rays,
         photometry=_photometric_model(seen, pose, light, index, pixels, is_sparse=is_sparse),
-        censoring=Censoring(clip.high, clip.low, clip.at_high[index], clip.at_low[index]),
+        censoring=replace(clip, at_high=clip.at_high[index], at_low=clip.at_low[index]),
         incidence=_edge_incidence(seen, pose, rays, index),
     )
 

@@ -34,7 +34,12 @@ from kgcp.measurement.discs.records import (
     moments_of_ellipse,
 )
 from kgcp.measurement.image_model.blur import Blur
-from kgcp.measurement.image_model.noise import Censoring, find_censoring, median_at_edges
+from kgcp.measurement.image_model.noise import (
+    Censoring,
+    find_censoring,
+    median_at_edges,
+    outlier_share,
+)
 
 _ROUNDS = 3
 _SETTLED_PX, _SETTLED_BLUR = 0.6, 0.2  # a round that moves less is the last
@@ -255,7 +260,7 @@ def check_disc_fit(fit: DiscFit, outline: DiscOutline) -> None:
     if fit.redundancy < _LEAST_REDUNDANCY:
         detail = f"only {np.count_nonzero(seen)} unclipped pixels for {len(fit.free.rows)} unknowns"
         raise DiscRejection(DiscReason.POOR_FIT, detail)
-    outlying = float(np.mean(fit.misfit.weight[seen] < 0.5)) if seen.any() else 1.0
+    outlying = outlier_share(fit.misfit, fit.levels, fit.sample.censoring)
     black, white = fit.state.plateaus(fit.free.tone)
     residual = median_at_edges(fit.sd, fit.share, 0.2, 0.8, math.nan)
     if not white - black > _LEAST_CONTRAST_COUNTS * fit.sample.window.levels_per_count:

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
-from kgcp.measurement.image_model.noise import Censoring, estimate_noise, find_censoring, misfit
+from kgcp.measurement.image_model.noise import (
+    Censoring,
+    estimate_noise,
+    find_censoring,
+    misfit,
+    outlier_share,
+)
 
 COUNT = 1.0 / 255.0
 OUTLYING = 3.5
@@ -25,7 +33,7 @@ def loss(levels: FloatArray, model: FloatArray, sd: FloatArray, clip: Censoring)
     parts = []
     for i in range(len(model)):
         one = slice(i, i + 1)
-        each = Censoring(clip.high, clip.low, clip.at_high[one], clip.at_low[one])
+        each = replace(clip, at_high=clip.at_high[one], at_low=clip.at_low[one])
         parts.append(misfit(levels[one], model[one], sd[one], each).total)
     return np.array(parts)
 
@@ -49,6 +57,27 @@ def test_score_and_weight_are_derivatives_of_the_loss() -> None:
     z = np.array([-9.0, -4.0, -3.3, -1.0, 0.0, 0.4, 2.0, 3.4, 3.6, 20.0])
     inlying = np.abs(z) < OUTLYING
     check_derivatives(0.5 - 0.02 * z, no_clipping(len(z)), curved=inlying)
+
+
+def test_light_clipped_before_its_noise_has_derivatives_that_still_lead_back() -> None:
+    """Of a model on either side of the ceiling, and of the floor."""
+    model = 0.5 + 0.02 * np.array([-9.0, -4.1, -2.1, -1.9, -0.5, 0.5, 1.9, 2.1, 4.1, 20.0, 40.0])
+    clip = replace(no_clipping(len(model)), ceiling=0.54, floor=0.46)
+    check_derivatives(model, clip, curved=np.abs(model - 0.5) < 0.05)
+    levels, sd = np.full_like(model, 0.5), np.full_like(model, 0.02)
+    score = misfit(levels, model, sd, clip).score
+    np.testing.assert_array_equal(np.sign(score), np.sign(levels - model))
+    beyond, at = (misfit(levels[:1], np.array([x]), sd[:1], clip).total for x in (0.64, 0.54))
+    assert at < beyond < misfit(levels[:1], np.array([0.56]), sd[:1], no_clipping(1)).total
+
+
+def test_a_model_beyond_clipped_light_makes_no_outliers_of_what_it_explains() -> None:
+    levels, model = np.array([0.99, 0.98, 0.5, 0.5]), np.array([1.0, 1.3, 0.51, 1.3])
+    clip = replace(no_clipping(4), ceiling=1.0)
+    found = misfit(levels, model, np.full(4, 0.02), clip)
+    assert outlier_share(found, model, clip) == 0.25
+    none_seen = replace(clip, at_high=np.ones(4, np.bool_))
+    assert outlier_share(found, model, none_seen) == 1.0
 
 
 @pytest.mark.parametrize("high", [True, False])
