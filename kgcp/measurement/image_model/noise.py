@@ -128,7 +128,8 @@ def _smeared_over(number: IndexArray) -> int:
         return 0
     steps = np.arange(1, _MOST_SMEARED + 1)
     excess = np.maximum(number[steps] - number[_MOST_SMEARED + 1 :].mean(), 0.0)
-    if excess.sum() < max(_SMEARED * number[_MOST_SMEARED + 1 :].sum(), _MIN_SAMPLES):
+    least = max(_SMEARED * number[_MOST_SMEARED + 1 :].sum(), _MIN_SAMPLES)
+    if not least <= excess.sum() <= number[0]:  # more of them are a plateau just below the end
         return 0
     return math.ceil(_SMEAR_SIGMAS * math.sqrt(float(excess @ steps**2 / excess.sum())))
 

@@ -280,6 +280,16 @@ def test_levels_that_are_clipped_at_once_are_not_smeared() -> None:
     assert clip.high / COUNT == pytest.approx(254.5)
 
 
+def test_a_noisy_plate_just_below_saturation_is_seen() -> None:
+    """Some of its pixels are clipped; the others say what it is, as none of a burnt plate does."""
+    rng = np.random.default_rng(6)
+    counts = np.minimum(np.rint(rng.normal(252.0, 3.0, 2000)), 255.0)
+    clip = find_censoring(counts * COUNT, COUNT)
+    assert clip.high / COUNT == pytest.approx(254.5)
+    assert clip.ceiling == np.inf
+    assert 0.1 < clip.share < 0.3
+
+
 def test_a_bright_plate_below_saturation_is_not_clipped() -> None:
     rng = np.random.default_rng(3)
     for count, full in ((COUNT, 200.0), (1.0 / 65535.0, 3600.0)):
