@@ -96,13 +96,15 @@ class RingErrors:
 _ground_of = cache(grow_ground)  # once per process
 
 
-def _errors_in_frame(plan: FlightPlan, index: int) -> tuple[list[FloatArray], float]:
-    """Return relative and standardised errors (3,) of each measured target, and the CPU time."""
+def errors_in_frame(plan: FlightPlan, index: int) -> tuple[list[FloatArray], float]:
+    """Return relative and standardised errors (3,) of each measured target, and the CPU time [s].
+
+    They are of the distance, relative and standardised, and of the centre, standardised.
+    """
     frame, camera = plan.frames[index], plan.settings.camera
-    grey = render_frame(plan, _ground_of(plan.seed), index)
-    if plan.settings.jpeg_quality is not None:
-        jpeg = np.frombuffer(encode_image(grey, plan.settings.jpeg_quality), np.uint8)
-        grey = np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE))
+    rendered = render_frame(plan, _ground_of(plan.seed), index)
+    file = np.frombuffer(encode_image(rendered, plan.settings.jpeg_quality), np.uint8)
+    grey = np.asarray(cv2.imdecode(file, cv2.IMREAD_GRAYSCALE))
     with single_threaded():
         begin_s = time.process_time()
         seen = examine(grey, camera, (TARGET_PLATE.target,), DetectSettings())
@@ -123,7 +125,7 @@ def errors_of(settings: SimulationSettings, seed: int, jobs: int = 1) -> RingErr
     """Return the errors in a flight."""
     found = list(
         ordered_map(
-            partial(_errors_in_frame, plan_flight(settings, seed)),
+            partial(errors_in_frame, plan_flight(settings, seed)),
             range(settings.frames),
             jobs=jobs,
             start=cv2.setNumThreads,
