@@ -21,10 +21,15 @@ FRAMES = 7
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Small frames of a camera with a film-like curve that flight.toml does not know."""
+    """Small frames of a camera with a film-like curve that flight.toml does not know.
+
+    They are not sharpened or compressed, which can look like parts of another curve.
+    """
     consumer = preset("consumer")
     settings = replace(
         consumer,
+        sensor=replace(consumer.sensor, sharpening=0.0),
+        jpeg_quality=None,
         camera=replace(consumer.camera, width=720, height=540, cx=364.2, cy=267.1),
         frames=FRAMES,
         distance_m=(14.0, 40.0),
