@@ -4,8 +4,10 @@ Usage: python -m benchmarks.accuracy.combinations [--frames 400] [--first 0] [--
 
 Each frame has a target of R 7 to 140 px and its own camera (known or unknown response, sharpening
 of any radius, noise, a phone's processing), lens, defocus, motion, exposure, shadows, dirt,
-highlight and compression. Columns as of `benchmarks.accuracy.ring_sizes`; a frame belongs to
-several lines. The five worst are named by their number, which is all that they are drawn from.
+highlight and compression. Columns: targets that were measured of all, mean and RMS standardised
+error of the distance, RMS of that of the centre, and distances off by more than three standard
+deviations. A frame belongs to several lines. The five worst are named by their number, which is all
+that they are drawn from.
 """
 
 from __future__ import annotations
@@ -23,14 +25,16 @@ from benchmarks.pool import ordered_map
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Response
 from kgcp.pipeline.execution.resilient_map import usable_cores
-from kgcp.simulation.flight import plan_flight
+from kgcp.simulation.flight import TARGET_PLATE, plan_flight
 from kgcp.simulation.imaging import Sensor, ToneCurve
 from kgcp.simulation.light_settings import Dirt, Glare, Shadow
 from kgcp.simulation.phone import Phone
 from kgcp.simulation.point_spread import Aberration
 from kgcp.simulation.presets import SimulationSettings, preset
 
-_OUTER_RADIUS_M, _FOCAL_PX, _LEAST_DISTANCE_M = 0.45, 2304.0, 7.5
+_PLAIN = preset("clean")
+_OUTER_RADIUS_M = 0.5 * TARGET_PLATE.target.ring.outer_diameter_m
+_FOCAL_PX, _LEAST_DISTANCE_M = _PLAIN.camera.mean_focal_px, 7.5
 _LARGE_PX = 110.0  # from this radius on, frames are larger
 _GROUNDS = 4  # seeds of the surroundings, which take seconds to grow
 _CAMERAS = (
@@ -50,12 +54,11 @@ def drawn(number: int) -> SimulationSettings:
     is_phone = response is Response.UNKNOWN and rng.random() < 0.25
     may_sharpen = response is Response.UNKNOWN and rng.random() < 0.7
     width, height = (840, 700) if radius_px > _LARGE_PX else (680, 540)
-    plain = preset("clean")
     tilt_deg = float(rng.uniform(0.0, 45.0 if rng.random() < 0.4 else 12.0))
     psf_px, gain = float(rng.uniform(0.45, 1.5)), _log_uniform(rng, 0.35, 2.2)
     streak_px = _now_and_then(rng, 0.25, 4.0)
     return replace(
-        plain,
+        _PLAIN,
         frames=1,
         absent_share=0.0,
         decoy_share=0.0,
@@ -65,7 +68,7 @@ def drawn(number: int) -> SimulationSettings:
         psf_px=(psf_px, psf_px),
         streak_px=(streak_px, streak_px),
         camera=replace(
-            plain.camera,
+            _PLAIN.camera,
             width=width,
             height=height,
             cx=0.5 * width + 2.6,

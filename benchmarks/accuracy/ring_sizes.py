@@ -7,7 +7,7 @@ ones have 37 to 140 px; large ones have 150 to 290 px and are seen in bins, or i
 pixels. Each line is a camera of a preset of `kgcp simulate` and a kind of light: how many of the
 targets are measured, the RMS error of the distance, its mean and RMS standardised, how many are off
 by more than three standard deviations, the RMS standardised error of the centre, and the median
-CPU time of a frame. Frames are not compressed, or by JPEG of that quality.
+CPU time of a frame. With `--quality`, frames are compressed as JPEG.
 """
 
 from __future__ import annotations

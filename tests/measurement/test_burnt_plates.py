@@ -35,7 +35,7 @@ def test_compressed_burnt_plates_are_measured_as_well_as_others(
     radius_px: float,
     percent: float,
 ) -> None:
-    """Taken for exact, the grey values beside clipped ones put large rings off by 0.1 to 0.8 %."""
+    """Taken for exact, the grey values beside clipped ones put these rings off by up to 0.4 %."""
     camera, sensor, standardised = replace(LENS, response=response), Sensor(tone=tone), []
     for seed in range(3):
         rng = np.random.default_rng(40 + seed)

@@ -259,7 +259,7 @@ def test_twelve_bits_in_a_file_of_sixteen_clip_where_values_pile_up() -> None:
 def test_what_compression_makes_of_clipped_levels_says_no_more_than_they(
     *, burnt: bool, flat: int
 ) -> None:
-    """At either end of the range, with grey values of edges all over it; in small and large."""
+    """At either end of the range, on small plates and large ones, with edges of all grey values."""
     rng = np.random.default_rng(4)
     smeared = np.clip(np.rint(rng.normal(255.0, 2.0, 800)), 0.0, 255.0)
     edges, other = rng.integers(0, 256, 500), np.rint(rng.normal(90.0, 3.0, 800))
@@ -281,7 +281,7 @@ def test_levels_that_are_clipped_at_once_are_not_smeared() -> None:
 
 
 def test_a_noisy_plate_just_below_saturation_is_seen() -> None:
-    """Some of its pixels are clipped; the others say what it is, as none of a burnt plate does."""
+    """Some of its pixels are clipped; the others show its level."""
     rng = np.random.default_rng(6)
     counts = np.minimum(np.rint(rng.normal(252.0, 3.0, 2000)), 255.0)
     clip = find_censoring(counts * COUNT, COUNT)
