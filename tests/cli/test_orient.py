@@ -80,13 +80,13 @@ def poses_of(folder: Path, flight: GroundFlight) -> tuple[np.ndarray, np.ndarray
 
 
 @pytest.mark.parametrize(
-    ("stated_m", "words"), [(0.9, ""), (0.899, "1.1 ‰"), (0.897, "3.3 ‰"), (0.906, "6.7 ‰")]
+    ("stated_m", "words"), [(0.9, ""), (0.899, "1.1 ‰"), (0.897, "3.4 ‰"), (0.906, "6.6 ‰")]
 )
 def test_diameters_that_are_all_wrong_displace_no_pose(
     tmp_path: Path, stated_m: float, words: str
 ) -> None:
     """Nobody states how well these rings are printed: 'place' measures it by such poses."""
-    flight = GroundFlight(stated_diameter_m=stated_m)
+    flight = GroundFlight(stated_diameter_m=stated_m, frames=6)
     folder = flight.write(tmp_path / "flight", sd_position_m=0.002)
     result = run("orient", folder, "--json")
     assert result.exit_code == 0, result.stderr
