@@ -12,7 +12,7 @@ from kgcp.pipeline.detect import RunOptions, detect_flight
 
 def test_a_run_that_is_killed_again_and_again_ends_with_the_same_table(tmp_path: Path) -> None:
     flight, out, tortured = (tmp_path / name for name in ("flight", "out", "tortured"))
-    make_flight(flight, 40, 1, rendered=8)
+    make_flight(flight, 20, 1, rendered=5)
     detect_flight(read_flight(flight), out=out, options=RunOptions(jobs=0))
     rng = random.Random(287)  # noqa: S311 - kills a worker, and the run soon after
     toll = torture(detecting(flight, tortured, 1), tortured, 2, rng)

@@ -17,7 +17,7 @@ from click.testing import CliRunner, Result
 from kgcp.cli import main
 from tests.flight_toml import RING_A
 
-FRAMES, FEW = 160, 4
+FRAMES, FEW = 100, 4
 TELLING_ALL = """\
 from kgcp.cli import detect_log, main
 detect_log._JSON_PROGRESS_S = 0.0
