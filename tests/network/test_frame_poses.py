@@ -51,7 +51,7 @@ def test_prints_are_off_one_by_one_or_alike(targets: int, sd_own: float, sd_alik
     """Poses scatter as stated, however the stated deviation of the prints is shared out."""
     rng, z, used = np.random.default_rng(3), [], 0
     names = [f"T{index}" for index in range(targets)]
-    for _ in range(24):
+    for _ in range(12):
         stated_m = rng.uniform(-6.0, 6.0, (targets, 3)) * [1.0, 1.0, 0.1]
         seen = POSE.in_camera(stated_m + SD_POSITION_M * rng.standard_normal((targets, 3)))
         pixels = CAMERA.project(seen) + SD_PX * rng.standard_normal((targets, 2))
@@ -68,7 +68,7 @@ def test_prints_are_off_one_by_one_or_alike(targets: int, sd_own: float, sd_alik
             continue
         used += len(found.used)
         z.append((found.pose.centre_m - POSE.centre_m) / np.sqrt(found.cov.diagonal()[:3]))
-    assert used >= 0.95 * 24 * targets
+    assert used >= 0.95 * 12 * targets
     assert 0.5 < float(np.sqrt(np.mean(np.square(z)))) < 1.3
 
 
@@ -157,11 +157,13 @@ def test_a_ring_alone_is_as_sure_as_the_less_sure_of_both_says(
     assert off_m / np.sqrt(sight @ found.cov[:3, :3] @ sight) == pytest.approx(1.0, abs=0.1)
 
 
-@pytest.mark.parametrize("frames", [5, 12])
-def test_a_ring_alone_shares_the_errors_of_positions_with_all_frames(frames: int) -> None:
+@pytest.mark.parametrize(("frames", "flights"), [(5, 14), (12, 8)])
+def test_a_ring_alone_shares_the_errors_of_positions_with_all_frames(
+    frames: int, flights: int
+) -> None:
     """More frames do not tell better how its plate lies, if the other targets are misplaced."""
     rng, z = np.random.default_rng(9), []
-    for seed in range(120 // frames):
+    for seed in range(flights):
         flight = GroundFlight(frames=frames, seed=seed)
         sightings = [
             measured_ring(flight, row, column, rng)

@@ -124,9 +124,10 @@ def test_a_camera_that_flies_on_does_not_lift_the_targets() -> None:
         z.append(
             [*(error_m / target.sds[:3]), target.check.diameter_residual_m / target.sd_diameter_m]
         )
-        without = placed(flight, sightings, None)
-        off_m = without.position_map[2] - flight.positions_map[0][2]
-        neglected.append(off_m / without.sds[2])
+        if len(neglected) < 3:
+            without = placed(flight, sightings, None)
+            off_m = without.position_map[2] - flight.positions_map[0][2]
+            neglected.append(off_m / without.sds[2])
     assert float(np.max(np.abs(neglected))) > 30.0
     assert float(np.abs(heights_m).max()) < 0.03
     assert 0.6 < float(np.sqrt(np.mean(np.square(z)))) < 1.3

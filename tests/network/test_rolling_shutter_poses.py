@@ -118,7 +118,7 @@ def places_of(flight: GroundFlight, rng: np.random.Generator) -> dict[str, Targe
 def test_unknown_motion_is_in_the_deviations(targets: int) -> None:
     """Poses are those of the middle row; all targets agree and none is thought misplaced."""
     rng, z, off_px = np.random.default_rng(5), [], []
-    for seed in range(4):
+    for seed in range(3):
         flight = GroundFlight(NAMES[:targets], OFFSETS_M[:targets], frames=8, seed=seed)
         places = places_of(flight, rng)
         sightings = []
@@ -133,15 +133,15 @@ def test_unknown_motion_is_in_the_deviations(targets: int) -> None:
             assert found.residuals is not None
             off_px.append(np.abs(found.residuals[:, :2]).max())
         assert wrong_position(poses, sightings, places, CAMERA, UNSTATED_SCALE_SD) is None
-    assert len(z) >= 30
-    assert 0.8 < float(np.sqrt(np.mean(np.square(z)))) < 1.2
+    assert len(z) >= 22  # of six errors, of which about three are independent
+    assert 0.75 < float(np.sqrt(np.mean(np.square(z)))) < 1.25
     assert float(np.max(off_px)) < 1.0  # three pixels without the motion
 
 
 def test_the_camera_s_rates_make_poses_more_certain() -> None:
     rng, sds, z = np.random.default_rng(6), [], []
-    for seed in range(4):
-        flight = GroundFlight(NAMES[:5], OFFSETS_M[:5], frames=6, seed=seed)
+    for seed in range(4):  # the errors of positions are those of all frames
+        flight = GroundFlight(NAMES[:5], OFFSETS_M[:5], frames=3, seed=seed)
         places = places_of(flight, rng)
         sightings, rotations = [], {}
         for row, frame in enumerate(flight.frame_names):
@@ -159,7 +159,7 @@ def test_the_camera_s_rates_make_poses_more_certain() -> None:
             for row, found in enumerate(poses)
         ]
     assert float(np.median(sds[1::2])) < 0.7 * float(np.median(sds[::2]))
-    assert 0.7 < float(np.sqrt(np.mean(np.square(z)))) < 1.2
+    assert 0.7 < float(np.sqrt(np.mean(np.square(z)))) < 1.3
 
 
 @pytest.mark.parametrize("shift_sd_m_s", [0.0, 29.0 * SD_RAD_S])
@@ -167,15 +167,15 @@ def test_a_ring_alone_is_seen_at_its_own_row(shift_sd_m_s: float) -> None:
     """Its pose is brought to the middle row, if the camera's rates tell all of the motion."""
     rng, z = np.random.default_rng(7), []
     for seed in range(12):
-        flight = GroundFlight(NAMES[:4], OFFSETS_M[:4], frames=5, seed=seed)
-        motions = np.repeat([shift_sd_m_s, SD_RAD_S], 3) * rng.standard_normal((5, 6))
+        flight = GroundFlight(NAMES[:4], OFFSETS_M[:4], frames=4, seed=seed)
+        motions = np.repeat([shift_sd_m_s, SD_RAD_S], 3) * rng.standard_normal((4, 6))
         rotations = {
             frame: scene_rotation(flight, row, motions[row, 3:], 1e-4)
             for row, frame in enumerate(flight.frame_names)
         }
         sightings = []
-        for row in range(5):
-            names = NAMES[:1] if row == 4 else NAMES[:4]
+        for row in range(4):
+            names = NAMES[:1] if row == 3 else NAMES[:4]
             sightings += sightings_of(flight, row, motions[row], rng, names)
         places = places_of(flight, rng)
         found = orient_frames(
@@ -185,9 +185,9 @@ def test_a_ring_alone_is_seen_at_its_own_row(shift_sd_m_s: float) -> None:
             CAMERA,
             sd_scale=0.0,
             rotations={} if shift_sd_m_s else rotations,
-        )[4]
+        )[3]
         assert found.is_by_one_ring
-        z.append(error_of(found, CameraPose(flight.centres[4], flight.rotations[4])))
+        z.append(error_of(found, CameraPose(flight.centres[3], flight.rotations[3])))
     assert 0.5 < float(np.sqrt(np.mean(np.square(z)))) < 1.2
 
 
@@ -195,7 +195,7 @@ def test_a_ring_alone_is_seen_at_its_own_row(shift_sd_m_s: float) -> None:
 def test_fields_in_frames_of_a_moving_camera(field: AnyField) -> None:
     rng, z = np.random.default_rng(8), []
     rolling = replace(fields.CAMERA, readout_s=READOUT_S)
-    for _ in range(12):
+    for _ in range(8):
         pose = fields.drawn_pose(rng)
         which, moments, covs = fields.images(field, pose, rng)
         motion = np.repeat([0.45 * SD_RAD_S, SD_RAD_S], 3) * rng.standard_normal(6)
@@ -205,4 +205,4 @@ def test_fields_in_frames_of_a_moving_camera(field: AnyField) -> None:
             moved = pose.moved(delays_s[index] * motion).in_camera(point[None])
             moments[index, :2] += fields.CAMERA.project(moved)[0] - still[index]
         z.append(fields.error_of(orient_by_field(rolling, field, which, moments, covs), pose))
-    assert 0.75 < float(np.sqrt(np.mean(np.square(z)))) < 1.25
+    assert 0.7 < float(np.sqrt(np.mean(np.square(z)))) < 1.3
