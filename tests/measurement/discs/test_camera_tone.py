@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 
+from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.discs.adjust_disc import DiscTask, adjust_disc
@@ -15,7 +18,7 @@ from kgcp.measurement.discs.joint_tone import JointFit, adjust_together
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.image_model.noise import Censoring
 from kgcp.measurement.image_model.photometry import Tone
-from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, photograph
+from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, field_irradiance, photograph
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 
 CAMERA = Camera(330, 250, 1000.0, 1000.0, 165.0, 125.0)
@@ -93,17 +96,21 @@ def test_curve_and_sharpening_are_those_of_the_camera(
 def small_discs(
     sensor: Sensor, levels: tuple[float, float], gradient: float, seed: int
 ) -> list[list[DiscTask]]:
-    """Return the discs of R 5 px of five photographs; dark ones if the first level is brighter."""
+    """Return the discs of R 5 px of three photographs; dark ones if the first level is brighter."""
     rng = np.random.default_rng(seed)
+    photos = [sensor.expose(light_of(levels, gradient, row), 1.0, rng) for row in range(3)]
+    return [[DiscTask(photo, each, []) for each in find_outlines(photo)] for photo in photos]
+
+
+@functools.cache
+def light_of(levels: tuple[float, float], gradient: float, number: int) -> FloatArray:
+    """Return what a photograph of small discs is taken of: to draw it takes long."""
+    off_px = np.random.default_rng(number).uniform(-0.5, 0.5, 2)
+    places = (24.0 * np.mgrid[-2:3, -1.5:2].reshape(2, -1).T + off_px) / 2e5
+    discs = tuple(SimulatedDisc((x, y, 0.0), 10.0 / 2e5) for x, y in places.tolist())
     camera = Camera(130, 105, 200_000.0, 200_000.0, 64.5, 52.0)
-    tasks = []
-    for _ in range(5):
-        places = (24.0 * np.mgrid[-2:3, -1.5:2].reshape(2, -1).T + rng.uniform(-0.5, 0.5, 2)) / 2e5
-        discs = tuple(SimulatedDisc((x, y, 0.0), 10.0 / 2e5) for x, y in places.tolist())
-        scene = FieldScene(discs, *levels, gradient=(gradient, 0.0))
-        grey = photograph(camera, POSE, scene, Optics(0.6), sensor, rng)
-        tasks.append([DiscTask(grey, outline, []) for outline in find_outlines(grey)])
-    return tasks
+    scene = FieldScene(discs, *levels, gradient=(gradient, 0.0))
+    return field_irradiance(camera, POSE, scene, Optics(0.6))
 
 
 def test_no_pixels_are_not_burnt() -> None:
