@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 
@@ -17,7 +18,7 @@ from kgcp.measurement.discs.measure import learn_camera, measure_discs
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.discs.records import Disc
 from kgcp.measurement.image_model.blur import Blur
-from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, field_circles, photograph
+from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, field_circles, field_irradiance
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 from kgcp.simulation.point_spread import Aberration
 
@@ -33,14 +34,20 @@ def field_of_discs(radius_px: float, rng: np.random.Generator) -> FieldScene:
     return FieldScene(tuple(discs), 0.62, 0.1, (0.0012, -0.0008))
 
 
+@functools.cache
+def light_of(scene: FieldScene, defocus_px: float) -> FloatArray:
+    """Return what photographs are taken of: to draw it takes longer than to measure them."""
+    optics = Optics(0.6, aberration=Aberration(defocus_px=defocus_px))
+    return field_irradiance(CAMERA, POSE, scene, optics)
+
+
 def radius_errors_px(
     defocus_px: float, tone: ToneCurve, response: Response, gain: float
 ) -> tuple[FloatArray, float]:
     """Errors of the radii of dark discs of R 8 px, and the kurtosis that was learned."""
     rng = np.random.default_rng(12)
     scene = field_of_discs(8.0, rng)
-    optics = Optics(0.6, aberration=Aberration(defocus_px=defocus_px))
-    grey = photograph(CAMERA, POSE, scene, optics, Sensor(tone=tone), rng, gain)
+    grey = Sensor(tone=tone).expose(light_of(scene, defocus_px), gain, rng)
     outlines = find_outlines(grey)
     camera = learn_camera([(grey, outlines)], response)
     discs = measure_discs(grey, outlines, response=response, camera=camera)
