@@ -114,7 +114,8 @@ def motions_of(flight: GroundFlight, time_s: FloatArray) -> CameraMotions:
 
 def test_a_camera_that_flies_on_does_not_lift_the_targets() -> None:
     """At 8 m/s, heights would be wrong by half a metre, and many stated to a centimetre."""
-    rng, z, heights_m, neglected = np.random.default_rng(4), [], [], []
+    rng, z, heights_m = np.random.default_rng(4), [], []
+    neglected: list[float] = []
     for _ in range(10):
         flight, time_s = strip(8.0, rng)
         sightings = sightings_of(flight, time_s, rng)
