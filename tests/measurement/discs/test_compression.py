@@ -237,7 +237,7 @@ def test_a_step_that_is_no_number_is_no_fit() -> None:
 
 def test_film_s_curve_is_learned_through_jpeg() -> None:
     """From the compressed values themselves it was sRGB's, with waves of 0.03 at most."""
-    tasks = tasks_of([compressed(photo, 92) for photo in small_discs(FILM, 0, 2)])
+    tasks = tasks_of([compressed(photo, 92) for photo in small_discs(FILM, 0, 2)], 14)
     learned = learn_tone(tasks, Response.UNKNOWN)
     assert learned.known is not None
     assert learned.tone is Tone.UNKNOWN  # a line, bent, is likelier by 3
