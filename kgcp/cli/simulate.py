@@ -98,6 +98,12 @@ PRESET_NAMES = (
     help="Put the lens out of focus: the radius of the disc that a point becomes.",
 )
 @click.option(
+    "--sharpening",
+    type=(click.FloatRange(0.0, 10.0), click.FloatRange(0.1, 10.0)),
+    metavar="STRENGTH PX",
+    help="Sharpen frames by an unsharp mask of this strength and sigma.",
+)
+@click.option(
     "--phone/--no-phone",
     default=None,
     help="Process frames as a phone does: Bayer mosaic, noise reduction, local tone mapping,"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 
+from kgcp.geometry.camera import Response
 from kgcp.simulation.light_settings import Dirt, Glare, Shadow
 from kgcp.simulation.point_spread import Aberration
 from kgcp.simulation.presets import SimulationSettings, preset
@@ -29,6 +30,7 @@ class Effects:
     astigmatism: float = 1.0  # ratio of the largest σ of the point spread to the smallest
     coma: float = 0.0  # third central moment of the point spread along its tail, over psf³
     defocus: float = 0.0  # radius of the disc that a point becomes by defocus [px]
+    sharpening: tuple[float, float] = (0.0, 1.0)  # strength of the unsharp mask, and its σ [px]
     phone: bool = False  # whether frames are processed as a phone does it
     rolling: float = 0.0  # time from the first row to the last [s]
     # motion of the image during that time [px/s]; None: random, anew in each frame
@@ -49,6 +51,7 @@ class Effects:
             astigmatism=lens.astigmatism,
             coma=lens.coma,
             defocus=lens.defocus_px,
+            sharpening=(settings.sensor.sharpening, settings.sensor.sharpening_px),
             phone=settings.phone is not None,
             rolling=settings.camera.readout_s,
             motion=None if settings.motion.sd_px_s else settings.motion.mean_px_s,
@@ -80,6 +83,8 @@ def with_effects(settings: SimulationSettings, wanted: Effects) -> SimulationSet
         settings = replace(settings, lens=lens)
     if wanted.phone != had.phone:
         settings = _as_of_a_phone(settings) if wanted.phone else replace(settings, phone=None)
+    if wanted.sharpening != had.sharpening:
+        settings = _sharpened(settings, *wanted.sharpening)
     if wanted.rolling != had.rolling:
         camera = replace(settings.camera, readout_s=wanted.rolling)
         settings = replace(settings, camera=camera)
@@ -109,6 +114,17 @@ def _as_of_a_phone(settings: SimulationSettings) -> SimulationSettings:
         camera=replace(settings.camera, response=phone.camera.response),
         jpeg_quality=phone.jpeg_quality,
     )
+
+
+def _sharpened(
+    settings: SimulationSettings, strength: float, sharpening_px: float
+) -> SimulationSettings:
+    """Return a camera that sharpens, of which nobody states a linear response then."""
+    sensor = replace(settings.sensor, sharpening=strength, sharpening_px=sharpening_px)
+    camera = settings.camera
+    if strength > 0.0 and camera.response is Response.LINEAR:
+        camera = replace(camera, response=Response.UNKNOWN)
+    return replace(settings, sensor=sensor, camera=camera)
 
 
 def effect_options(settings: SimulationSettings) -> str:

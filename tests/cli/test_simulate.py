@@ -63,6 +63,7 @@ EFFECTS: dict[str, Any] = {
     "astigmatism": 1.4,
     "defocus": 1.5,
     "coma": 0.1,
+    "sharpening": (0.5, 2.0),
     "phone": True,
     "rolling": 0.02,
     "motion": (30.0, -40.0),
@@ -75,9 +76,18 @@ def test_every_effect_can_be_added_to_every_preset(name: str, effect: str) -> No
     before = Effects.of(preset(name))
     if effect == "coma":
         before = replace(before, astigmatism=1.0)
+    if effect == "phone" and not before.phone:  # it sharpens in its own way
+        before = replace(before, sharpening=Effects.of(preset("phone")).sharpening)
     wanted = replace(before, **{effect: EFFECTS[effect]})
     assert Effects.of(with_effects(preset(name), wanted)) == wanted
     assert with_effects(preset(name), Effects.of(preset(name))) == preset(name)
+
+
+def test_a_camera_that_sharpens_is_not_stated_to_be_linear() -> None:
+    settings = preset("clean")
+    assert settings.camera.response is Response.LINEAR
+    sharpened = with_effects(settings, replace(Effects.of(settings), sharpening=(0.5, 2.0)))
+    assert sharpened.camera.response is Response.UNKNOWN
 
 
 def test_options_of_effects_reach_the_flight_and_its_readme(tmp_path: Path) -> None:
@@ -85,7 +95,7 @@ def test_options_of_effects_reach_the_flight_and_its_readme(tmp_path: Path) -> N
     options = [
         *("--shadow", "0.6", "--stripes", "2", "--dirt", "0.03", "--stains", "4"),
         *("--glare", "0.3", "--astigmatism", "1.4", "--coma", "0.1"),
-        *("--defocus", "1.5", "--phone"),
+        *("--defocus", "1.5", "--sharpening", "0.7", "2", "--phone"),
         *("--rolling", "0.02", "--motion", "30", "-40"),
     ]
     only = ["--preset", "sample", "--frames", "1"]
