@@ -137,7 +137,7 @@ def imaging_of() -> Callable[..., FitProblem]:
             outer_radius_px=semi_major_axis_px(contour_px(camera, pose, radius_m)),
             centre_px=camera.project(pose.translation_m),
             focal_px=camera.mean_focal_px,
-            censoring=find_censoring(window.levels, window.levels_per_count),
+            censoring=find_censoring(window.levels, window.levels_per_count, window.width),
             tone=Tone.of(camera.response),
             sharpening_px=0.0 if camera.response is Response.LINEAR else 1.2,
         )

@@ -143,7 +143,7 @@ def adjust_disc(
         if not is_enough:
             raise DiscRejection(DiscReason.CROWDED, "too little free ground")
         state = state or _start(task, window, index, geometry, blur, free)
-        limits = find_censoring(window.levels, window.levels_per_count)
+        limits = find_censoring(window.levels, window.levels_per_count, window.width)
         if limits.share > MUCH_CLIPPED:  # of a level that is clipped no gradient is seen
             free = free.without_ink_slope()
         fit = _adjust_on(task, window, limits, index, state, free)

@@ -154,7 +154,7 @@ def _sample_with_all_ground(fit: DiscFit, others: Sequence[Geometry]) -> DiscSam
     is_middle = off_px < -REACH_SIGMAS * state.blur.largest_sd_px
     row, column = np.divmod(index, window.width)
     index = index[~is_middle | ((3 * row + column) % _EVERY_OF_MIDDLE == 0)]
-    limits = find_censoring(window.levels, window.levels_per_count)
+    limits = find_censoring(window.levels, window.levels_per_count, window.width)
 
     def sample_of(index: IndexArray) -> DiscSample:
         """Take pixels of the window, by their flat indices."""

@@ -114,7 +114,7 @@ def cut_window(
 
 def _clipped(part: GreyArray, binning: int, levels: FloatArray, count: float) -> FloatArray:
     """Return the share (n,) of clipped pixels in every bin."""
-    limits = find_censoring(levels, count)
+    limits = find_censoring(levels, count, part.shape[1] // binning)
     clipped = (part >= limits.high / count) | (part <= limits.low / count)
     return _binned(clipped, binning).ravel()
 

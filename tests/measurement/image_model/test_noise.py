@@ -18,6 +18,7 @@ from kgcp.measurement.image_model.noise import (
 
 COUNT = 1.0 / 255.0
 OUTLYING = 3.5
+WIDTH = 50  # pixels of a row
 
 
 def no_clipping(count: int) -> Censoring:
@@ -235,7 +236,7 @@ def test_noise_is_never_below_that_of_rounding() -> None:
 
 def test_the_ends_of_the_range_are_clipped() -> None:
     levels = np.array([0.0, 1.0, 2.0, 100.0, 254.0, 255.0]) * COUNT
-    clip = find_censoring(levels, COUNT)
+    clip = find_censoring(levels, COUNT, len(levels))
     assert clip.at_low.tolist() == [True] + [False] * 5
     assert clip.at_high.tolist() == [False] * 5 + [True]
     assert 254.0 * COUNT < clip.high < 1.0
@@ -248,7 +249,7 @@ def test_twelve_bits_in_a_file_of_sixteen_clip_where_values_pile_up() -> None:
     bright = np.minimum(np.rint(rng.normal(1.1 * full, 0.02 * full, 900)), full)
     dark = np.rint(rng.normal(300.0, 20.0, 1500))
     levels = np.concatenate((dark, bright)) * count
-    clip = find_censoring(levels, count)
+    clip = find_censoring(levels, count, WIDTH)
     np.testing.assert_array_equal(clip.at_high, levels == full * count)
     assert not clip.at_low.any()
     assert clip.high == pytest.approx(full * count, abs=count)
@@ -264,7 +265,7 @@ def test_what_compression_makes_of_clipped_levels_says_no_more_than_they(
     smeared = np.clip(np.rint(rng.normal(255.0, 2.0, 800)), 0.0, 255.0)
     edges, other = rng.integers(0, 256, 500), np.rint(rng.normal(90.0, 3.0, 800))
     counts = np.concatenate((smeared, edges, other, np.full(flat, 255.0)))
-    clip = find_censoring((counts if burnt else 255.0 - counts) * COUNT, COUNT)
+    clip = find_censoring((counts if burnt else 255.0 - counts) * COUNT, COUNT, WIDTH)
     at_end, high = (clip.at_high, clip.high) if burnt else (clip.at_low, 1.0 - clip.low)
     assert 247.0 < high / COUNT < 251.0
     assert at_end[:800].mean() > 0.97
@@ -276,15 +277,31 @@ def test_what_compression_makes_of_clipped_levels_says_no_more_than_they(
 def test_levels_that_are_clipped_at_once_are_not_smeared() -> None:
     rng = np.random.default_rng(4)
     edges = rng.integers(0, 256, 500)
-    clip = find_censoring(np.concatenate((np.full(800, 255), edges)) * COUNT, COUNT)
+    clip = find_censoring(np.concatenate((np.full(800, 255), edges)) * COUNT, COUNT, WIDTH)
     assert clip.high / COUNT == pytest.approx(254.5)
+
+
+@pytest.mark.parametrize("burnt", [True, False])
+def test_what_lies_just_below_the_end_beside_edges_alone_is_not_smeared(*, burnt: bool) -> None:
+    """An edge ends there, or one colour is not yet clipped; compression smears elsewhere, too."""
+    rng = np.random.default_rng(7)
+    rows = np.full((WIDTH, WIDTH), 255.0)
+    rows[:, 20:30] = (214.0, 120.0, *[30.0] * 6, 120.0, 214.0)
+    beside, away = rows.copy(), rows.copy()
+    beside[:, 19], away[:, 17] = rng.integers(249, 255, (2, WIDTH))
+    for counts, smears in ((beside, False), (away, True)):
+        levels = (counts if burnt else 255.0 - counts).ravel() * COUNT
+        clip = find_censoring(levels, COUNT, WIDTH)
+        high, is_limited = (clip.high, clip.ceiling) if burnt else (1.0 - clip.low, clip.floor)
+        assert (high / COUNT < 252.0) == smears
+        assert np.isfinite(is_limited) == smears
 
 
 def test_a_noisy_plate_just_below_saturation_is_seen() -> None:
     """Some of its pixels are clipped; the others show its level."""
     rng = np.random.default_rng(6)
     counts = np.minimum(np.rint(rng.normal(252.0, 3.0, 2000)), 255.0)
-    clip = find_censoring(counts * COUNT, COUNT)
+    clip = find_censoring(counts * COUNT, COUNT, WIDTH)
     assert clip.high / COUNT == pytest.approx(254.5)
     assert clip.ceiling == np.inf
     assert 0.1 < clip.share < 0.3
@@ -294,6 +311,6 @@ def test_a_bright_plate_below_saturation_is_not_clipped() -> None:
     rng = np.random.default_rng(3)
     for count, full in ((COUNT, 200.0), (1.0 / 65535.0, 3600.0)):
         levels = np.rint(rng.normal(full, 0.02 * full, 2000)) * count
-        clip = find_censoring(levels, count)
+        clip = find_censoring(levels, count, WIDTH)
         assert not clip.at_high.any()
         assert clip.high > levels.max()
