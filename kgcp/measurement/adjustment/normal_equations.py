@@ -14,7 +14,7 @@ from kgcp.geometry._jit import compiled, summed
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.image_model.noise import Misfit
-from kgcp.measurement.image_model.photometry import PARAM_COUNT
+from kgcp.measurement.image_model.photometry import PARAM_COUNT, SHAPE_PARAMS
 
 _LIKE_A_TILT = 0.07  # of the distance: a tilt of 1 rad is damped at least like such a change
 _DEPTH, _FIRST_TURN, _LAST_TURN = 2, 3, 5  # among the parameters
@@ -29,6 +29,11 @@ class Unknowns:
     mean: FloatArray
     precision: FloatArray
     free_precision: FloatArray  # (p,): of the estimated parameters
+
+    @property
+    def has_shape(self) -> bool:
+        """Whether skew or kurtosis of the point spread are estimated."""
+        return bool(self.free[-1] >= SHAPE_PARAMS[0])
 
     def penalty(self, parameters: Parameters) -> float:
         """Return the priors' part of the negative log-likelihood."""

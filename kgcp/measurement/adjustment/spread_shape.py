@@ -16,6 +16,8 @@ _SKEW_SD_PX3 = 1.0  # skewness 0.6 of a spread of 1.2 px
 # Defocus alone has an excess kurtosis of −1, with a pixel and a lens's own blur −0.4 to −0.7. A
 # weaker prior makes rings of R < 13 px worse.
 _KURTOSIS_SD = 0.5
+SHAPE_PRECISIONS = np.array([_SKEW_SD_PX3**-2] * len(SKEW_PARAMS) + [_KURTOSIS_SD**-2])
+"""Inverse a-priori variances of `SHAPE_PARAMS`."""
 # χ² of four degrees of freedom: the 98 targets of six flights of `benchmarks.accuracy` without skew
 # have 13 at most, the 14 of light/lens 35 and more.
 _SKEW_CHI2 = 25.0
@@ -43,11 +45,11 @@ def shape_needed(fit: TargetFit) -> list[int]:
     them is asked for by `KURTOSIS_CHI2_WITH_LEVELS`; otherwise it would let fits rest where they
     start (by 0.6 σ in a test).
     """
-    if fit.sample.problem.window.binning > 1 or fit.unknowns.free[-1] >= SHAPE_PARAMS[0]:
+    if fit.sample.problem.window.binning > 1 or fit.unknowns.has_shape:
         return []
     if fit.level_equations is not None:
         return SKEW_PARAMS
-    by_shape, scaled = _by_shape(fit) / fit.sd, fit.scaled_jacobian
+    by_shape, scaled = rows_by_shape(fit), fit.scaled_jacobian
     normal = normal_matrix(scaled, fit.misfit, fit.unknowns)
     score, weighted = by_shape @ fit.misfit.score, by_shape * fit.misfit.weight
     mixed = scaled @ weighted.T
@@ -58,19 +60,22 @@ def shape_needed(fit: TargetFit) -> list[int]:
     return [int(Param.KURTOSIS)] if score[-1] ** 2 > least * own[-1, -1] else []
 
 
-def _by_shape(fit: TargetFit) -> FloatArray:
-    """Return the derivatives (5, n) of the grey values by skew and kurtosis; the rest is known."""
+def rows_by_shape(fit: TargetFit) -> FloatArray:
+    """Return the derivatives (5, n) of the grey values by skew and kurtosis, in units of the noise.
+
+    All else is as the fit has it.
+    """
     sample, parameters, share = fit.sample, fit.parameters, fit.prediction.share
     views, blur = views_of(parameters.matrix, sample.rays), parameters.blur
     skew = skew_rows(views, blur.total_covariance, sample.incidence)
     kurtosis = kurtosis_row(share, parameters.matrix, sample.rays, blur.vector, sample.incidence)
     rows = np.vstack((skew, kurtosis))
-    return sample.photometry.level_changes(share, parameters.light, rows)
+    return sample.photometry.level_changes(share, parameters.light, rows) / fit.sd
 
 
 def with_shape(unknowns: Unknowns, shape: list[int]) -> Unknowns:
     """Return the unknowns with some parameters of the point spread's shape among them."""
     free = np.append(unknowns.free, shape)
     precision = unknowns.precision.copy()
-    precision[SKEW_PARAMS], precision[Param.KURTOSIS] = _SKEW_SD_PX3**-2, _KURTOSIS_SD**-2
+    precision[SHAPE_PARAMS] = SHAPE_PRECISIONS
     return Unknowns(free, unknowns.mean, precision, precision[free])
