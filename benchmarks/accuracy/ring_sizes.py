@@ -7,7 +7,8 @@ ones have 37 to 140 px; large ones have 150 to 290 px and are seen in bins, or i
 pixels. Each line is a camera of a preset of `kgcp simulate` and a kind of light: how many of the
 targets are measured, the RMS error of the distance, its mean and RMS standardised, how many are off
 by more than three standard deviations, the RMS standardised error of the centre, and the median
-CPU time of a frame. With `--quality`, frames are compressed as JPEG.
+CPU time of a frame. With `--quality`, frames are compressed as JPEG; `--astigmatism`, `--coma` and
+`--defocus` are those of `kgcp simulate`.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from kgcp.simulation.flight import (
     render_frame,
 )
 from kgcp.simulation.light_settings import Dirt, Glare, Shadow
+from kgcp.simulation.point_spread import Aberration
 from kgcp.simulation.presets import SimulationSettings, preset
 
 _CAMERAS = ("clean", "consumer")
@@ -142,18 +144,29 @@ def errors_of(settings: SimulationSettings, seed: int, jobs: int = 1) -> RingErr
 @click.option("--size", type=click.Choice(list(SIZES)), default="small", show_default=True)
 @click.option("--frames", type=click.IntRange(2), default=60, show_default=True, help="Per line.")
 @click.option("--quality", type=click.IntRange(1, 100), default=None, help="Of JPEG.")
+@click.option("--astigmatism", type=click.FloatRange(1.0, 5.0), default=1.0, help="Of the lens.")
+@click.option("--coma", type=click.FloatRange(0.0, 0.2), default=0.0, help="Of the lens.")
+@click.option("--defocus", type=click.FloatRange(0.0, 10.0), default=0.0, help="Of the lens [px].")
 @click.option("--seed", type=click.IntRange(0), default=77, show_default=True)
 @click.option("--jobs", type=click.IntRange(1, 256), default=None)
-def main(size: str, frames: int, quality: int | None, seed: int, jobs: int | None) -> None:
+def main(
+    size: str,
+    frames: int,
+    quality: int | None,
+    astigmatism: float,
+    coma: float,
+    defocus: float,
+    seed: int,
+    jobs: int | None,
+) -> None:
     """Print the table."""
+    aberration = Aberration(astigmatism=astigmatism, coma=coma, defocus_px=defocus)
+    lens = None if aberration == Aberration() else aberration
     print("camera    light             found  error [%]  z mean   z RMS  > 3  z of centre  ms")
     for camera in _CAMERAS:
         for light in _LIGHTS:
-            errors = errors_of(
-                settings_of(camera, light, frames, SIZES[size], quality),
-                seed,
-                jobs or usable_cores(),
-            )
+            settings = settings_of(camera, light, frames, SIZES[size], quality)
+            errors = errors_of(replace(settings, lens=lens), seed, jobs or usable_cores())
             z = errors.distance
             print(
                 f"{camera:10s}{light:18s}{len(z):5d}{100.0 * _rms(errors.relative):11.4f}"
