@@ -20,7 +20,7 @@ import click
 import cv2
 import numpy as np
 
-from benchmarks.accuracy.ring_sizes import errors_in_frame
+from benchmarks.accuracy.ring_sizes import errors_in_frame, rms
 from benchmarks.pool import ordered_map
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Response
@@ -190,8 +190,8 @@ def lines_of(outcomes: Sequence[Outcome]) -> Iterable[str]:
             continue
         _, z, of_centre = np.array(errors).T
         yield (
-            f"{name:18s}{len(errors):5d}/{len(chosen):<5d}{z.mean():7.2f}{_rms(z):8.2f}"
-            f"{_rms(of_centre):13.2f}{np.count_nonzero(np.abs(z) > 3.0):5d}"
+            f"{name:18s}{len(errors):5d}/{len(chosen):<5d}{z.mean():7.2f}{rms(z):8.2f}"
+            f"{rms(of_centre):13.2f}{np.count_nonzero(np.abs(z) > 3.0):5d}"
         )
     for each in sorted(outcomes, key=lambda each: -each.worst)[:5]:
         if each.errors is not None:
@@ -200,10 +200,6 @@ def lines_of(outcomes: Sequence[Outcome]) -> Iterable[str]:
                 f"frame {each.number}: R {each.radius_px:.0f} px,"
                 f" distance {100.0 * relative:+.4f} %, z {z:+.1f}, of centre {of_centre:.1f}"
             )
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 @click.command()

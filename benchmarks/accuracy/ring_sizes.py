@@ -169,14 +169,15 @@ def main(
             errors = errors_of(replace(settings, lens=lens), seed, jobs or usable_cores())
             z = errors.distance
             print(
-                f"{camera:10s}{light:18s}{len(z):5d}{100.0 * _rms(errors.relative):11.4f}"
-                f"{z.mean():8.2f}{_rms(z):8.2f}{np.count_nonzero(np.abs(z) > 3.0):5d}"
-                f"{_rms(errors.centre):13.2f}{1e3 * errors.seconds:5.0f}",
+                f"{camera:10s}{light:18s}{len(z):5d}{100.0 * rms(errors.relative):11.4f}"
+                f"{z.mean():8.2f}{rms(z):8.2f}{np.count_nonzero(np.abs(z) > 3.0):5d}"
+                f"{rms(errors.centre):13.2f}{1e3 * errors.seconds:5.0f}",
                 flush=True,
             )
 
 
-def _rms(values: FloatArray) -> float:
+def rms(values: FloatArray) -> float:
+    """Return the root of the mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 

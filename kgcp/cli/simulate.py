@@ -160,11 +160,13 @@ def command(
 
     from kgcp.io.flight.field_file import read_field
     from kgcp.pipeline.execution.resilient_map import usable_cores
-    from kgcp.simulation.effects import Effects, with_effects
+    from kgcp.simulation.effects import Effects, with_effects, with_phone
     from kgcp.simulation.presets import preset
 
     settings = preset(preset_name)
     given: dict[str, Any] = {key: value for key, value in effects.items() if value is not None}
+    if "phone" in given:  # before all others: it sharpens in its own way, unless that is given, too
+        settings = with_phone(settings, is_phone=given["phone"])
     settings = with_effects(settings, replace(Effects.of(settings), **given))
     if field_text is not None:
         if not survey_errors:

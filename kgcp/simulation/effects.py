@@ -1,7 +1,7 @@
-"""One number for each effect of real light: how strong it is in a simulated flight.
+"""A number or two for each effect of real light: how strong it is in a simulated flight.
 
-Without the effect it is neutral: 1 for the share of the light that is left and for the ratio of the
-astigmatism, 0 for all others.
+Without the effect they are neutral: 1 for the share of the light that is left and for the ratio of
+the astigmatism, 0 for all others.
 """
 
 from __future__ import annotations
@@ -56,6 +56,11 @@ class Effects:
             rolling=settings.camera.readout_s,
             motion=None if settings.motion.sd_px_s else settings.motion.mean_px_s,
         )
+
+
+def with_phone(settings: SimulationSettings, *, is_phone: bool) -> SimulationSettings:
+    """Return a flight's settings with a phone's processing, which sharpens, or without it."""
+    return with_effects(settings, replace(Effects.of(settings), phone=is_phone))
 
 
 def with_effects(settings: SimulationSettings, wanted: Effects) -> SimulationSettings:
@@ -129,9 +134,11 @@ def _sharpened(
 
 def effect_options(settings: SimulationSettings) -> str:
     """Return the options by which a flight's effects differ from those of its preset."""
-    wanted, usual = asdict(Effects.of(settings)), asdict(Effects.of(preset(settings.name)))
+    effects, start = Effects.of(settings), preset(settings.name)
+    usual = asdict(Effects.of(with_phone(start, is_phone=effects.phone)))
+    usual["phone"] = Effects.of(start).phone
     words = []
-    for name, value in wanted.items():
+    for name, value in asdict(effects).items():
         if value == usual[name]:
             continue
         if isinstance(value, bool):

@@ -111,6 +111,20 @@ def test_options_of_effects_reach_the_flight_and_its_readme(tmp_path: Path) -> N
         assert frame.mode == "RGB"
 
 
+@pytest.mark.parametrize(
+    "options", ["--phone", "--sharpening 0 1 --phone", "--sharpening 0.8 1.2 --no-phone"]
+)
+def test_sharpening_is_the_phones_unless_it_is_given(tmp_path: Path, options: str) -> None:
+    """The README's command makes the same flight, also with what its preset has of itself."""
+    name = "phone" if "--no-phone" in options else "clean"
+    out = tmp_path / "flight"
+    arguments = ["--preset", name, "--frames", "1", "--jobs", "1", *options.split()]
+    assert CliRunner().invoke(main, ["simulate", str(out), *arguments]).exit_code == 0
+    kept = options.replace("--sharpening 0.8 1.2 ", "")  # the preset's own
+    command = f"kgcp simulate OUT --preset {name} --frames 1 --seed 1 {kept}\n"
+    assert command in (out / "README.md").read_text(encoding="utf-8")
+
+
 def test_too_much_coma_ends_in_one_line(tmp_path: Path) -> None:
     out = str(tmp_path / "flight")
     result = CliRunner().invoke(main, ["simulate", out, "--preset", "lens", "--coma", "0.4"])

@@ -25,7 +25,11 @@ from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.normal_equations import normal_matrix
 from kgcp.measurement.adjustment.problem import SMALL_RING_PX
 from kgcp.measurement.adjustment.solver import TargetFit, noise_of
-from kgcp.measurement.adjustment.spread_shape import SHAPE_PRECISIONS, rows_by_shape
+from kgcp.measurement.adjustment.spread_shape import (
+    SHAPE_PRECISIONS,
+    ShapeEquations,
+    equations_by_shape,
+)
 from kgcp.measurement.image_model.noise import median_at_edges
 from kgcp.measurement.image_model.photometry import (
     SKEW_PARAMS,
@@ -134,7 +138,7 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
         shift = _shift_by_kurtosis(fit, inverse, mean)
         pose_cov += np.outer(shift, shift)
     if _is_of_small_ring(fit) and not fit.unknowns.has_shape and fit.level_equations is None:
-        pose_cov += _by_shape_left_out(fit, scaled, inverse, max(1.0, mean))
+        pose_cov += _by_shape_left_out(equations_by_shape(fit, scaled, normal), max(1.0, mean))
     shutter = fit.sample.problem.shutter
     if shutter is not None:
         pose_cov += _by_unknown_rotation(fit, shutter)
@@ -192,9 +196,7 @@ def _shift_by_kurtosis(fit: TargetFit, inverse: FloatArray, inflation: float) ->
     return np.asarray(size * inverse[:6, k] / inverse[k, k])
 
 
-def _by_shape_left_out(
-    fit: TargetFit, scaled: FloatArray, inverse: FloatArray, inflation: float
-) -> FloatArray:
+def _by_shape_left_out(by_shape: ShapeEquations, inflation: float) -> FloatArray:
     """Return what skew and kurtosis of the point spread, left at 0, add to the covariance (6, 6).
 
     Residuals of small rings mostly show too little of them to make them free. What they show, one
@@ -203,17 +205,13 @@ def _by_shape_left_out(
     the centre's z was 1.9 to 2.2 and is 0.9 to 1.1; out of focus by 1.5 px, the distance's was 1.3
     and is 1.0. Behind Gaussian spreads both stay as they are.
     """
-    by_shape = rows_by_shape(fit)
-    weighted = by_shape * fit.misfit.weight
-    mixed = scaled @ weighted.T
-    own = weighted @ by_shape.T - mixed.T @ inverse @ mixed + np.diag(SHAPE_PRECISIONS)
-    cov = np.linalg.inv(own)
-    seen = cov @ (by_shape @ fit.misfit.score)
+    cov = np.linalg.inv(by_shape.normal + np.diag(SHAPE_PRECISIONS))
+    seen = cov @ by_shape.score
     added = np.zeros((6, 6))
     for part in (slice(0, len(SKEW_PARAMS)), slice(len(SKEW_PARAMS), None)):
         chi2 = float(seen[part] @ np.linalg.solve(inflation * cov[part, part], seen[part]))
         share = max(0.0, 1.0 - len(seen[part]) / chi2) if chi2 > 0.0 else 0.0
-        shift = inverse[:6] @ mixed[:, part] @ seen[part]
+        shift = by_shape.displacement[:6, part] @ seen[part]
         added += share * np.outer(shift, shift)
     return added
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
@@ -49,28 +51,49 @@ def shape_needed(fit: TargetFit) -> list[int]:
         return []
     if fit.level_equations is not None:
         return SKEW_PARAMS
-    by_shape, scaled = rows_by_shape(fit), fit.scaled_jacobian
-    normal = normal_matrix(scaled, fit.misfit, fit.unknowns)
-    score, weighted = by_shape @ fit.misfit.score, by_shape * fit.misfit.weight
-    mixed = scaled @ weighted.T
-    own = weighted @ by_shape.T - mixed.T @ np.linalg.solve(normal, mixed)
+    scaled = fit.scaled_jacobian
+    by_shape = equations_by_shape(fit, scaled, normal_matrix(scaled, fit.misfit, fit.unknowns))
+    score, own = by_shape.score, by_shape.normal
     if score[:-1] @ np.linalg.solve(own[:-1, :-1], score[:-1]) > _SKEW_CHI2:
         return SHAPE_PARAMS
     least = _KURTOSIS_CHI2_BY_UNKNOWN_TONE if fit.sample.problem.tone.is_shaped else _KURTOSIS_CHI2
     return [int(Param.KURTOSIS)] if score[-1] ** 2 > least * own[-1, -1] else []
 
 
-def rows_by_shape(fit: TargetFit) -> FloatArray:
-    """Return the derivatives (5, n) of the grey values by skew and kurtosis, in units of the noise.
+class ShapeEquations(NamedTuple):
+    """Normal equations of skew and kurtosis, with all parameters of a fit eliminated."""
 
-    All else is as the fit has it.
+    score: FloatArray  # (5,): derivatives of the log-likelihood
+    normal: FloatArray  # (5, 5): without priors
+    displacement: FloatArray  # (p, 5): of the free parameters, if the shape is left out
+
+
+def equations_by_shape(fit: TargetFit, scaled: FloatArray, normal: FloatArray) -> ShapeEquations:
+    """Return the equations of a shape that a fit has left out.
+
+    Parameters
+    ----------
+    scaled : (p, n) array
+        Jacobian of the free parameters, in units of the noise.
+    normal : (p, p) array
+        Their normal matrix.
     """
+    rows = _by_shape(fit) / fit.sd
+    weighted = rows * fit.misfit.weight
+    mixed = scaled @ weighted.T
+    displacement = np.asarray(np.linalg.solve(normal, mixed), np.float64)
+    own = weighted @ rows.T - mixed.T @ displacement
+    return ShapeEquations(rows @ fit.misfit.score, own, displacement)
+
+
+def _by_shape(fit: TargetFit) -> FloatArray:
+    """Return the derivatives (5, n) of the grey values by skew and kurtosis; the rest is known."""
     sample, parameters, share = fit.sample, fit.parameters, fit.prediction.share
     views, blur = views_of(parameters.matrix, sample.rays), parameters.blur
     skew = skew_rows(views, blur.total_covariance, sample.incidence)
     kurtosis = kurtosis_row(share, parameters.matrix, sample.rays, blur.vector, sample.incidence)
     rows = np.vstack((skew, kurtosis))
-    return sample.photometry.level_changes(share, parameters.light, rows) / fit.sd
+    return sample.photometry.level_changes(share, parameters.light, rows)
 
 
 def with_shape(unknowns: Unknowns, shape: list[int]) -> Unknowns:
