@@ -235,6 +235,8 @@ def _learned_kurtosis(in_focus: JointFit, sds: Sequence[FloatArray]) -> float:
         begin, first = _DEFOCUSED_STEP, defocused
     steps, best = _likeliest_along(lambda steps: at(begin + steps), first, _MOST_KURTOSIS_STEPS)
     gain = in_focus.loss - best.loss
+    if gain <= 0.0:
+        return 0.0
     is_compressed = any(each is not None for each in _steps_of(best.fits))
     least = _WORTHY_IN_COMPRESSED if is_compressed else _WORTHY_KURTOSIS
     is_worthy = 2.0 * gain > least * _excess(best) ** _BY_EXCESS

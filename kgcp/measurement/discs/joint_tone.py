@@ -63,14 +63,15 @@ class JointFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Reduced:
-    """Normal equations of what is shared, with all else eliminated."""
+    """Normal equations of what k discs share, with all else eliminated."""
 
     is_shared: BoolArray  # (p,)
-    normals: list[FloatArray]  # (c, c) of each disc
-    gradients: list[FloatArray]
-    inverse_others: list[FloatArray]
-    between: list[FloatArray]
-    own_gradients: list[FloatArray]
+    normals: FloatArray  # (k, c, c)
+    gradients: FloatArray  # (k, c)
+    # of what is each disc's own, p - c = r unknowns
+    inverse_others: FloatArray  # (k, r, r)
+    between: FloatArray  # (k, c, r)
+    own_gradients: FloatArray  # (k, r)
 
 
 def adjust_together(
@@ -255,12 +256,15 @@ def _minimised(
         What compression left of each disc's; None: there was none.
     """
     pixels = [None] * len(samples) if pixels is None else pixels
+    frees = [sample.unknowns(free) for sample in samples]
 
     def at(places: Sequence[DiscState]) -> list[DiscFit]:
-        return [
-            compressed_fit_at(sample, state, sample.unknowns(free), sd, left)
-            for sample, state, sd, left in zip(samples, places, sds, pixels, strict=True)
-        ]
+        each = zip(samples, places, frees, sds, pixels, strict=True)
+        return [compressed_fit_at(*of_disc) for of_disc in each]
+
+    def moved(fits: Sequence[DiscFit], steps: FloatArray) -> list[DiscFit]:
+        pairs = zip(fits, steps, strict=True)
+        return at([fit.state.moved(step, free.tone) for fit, step in pairs])
 
     fits, damping = at(states), _DAMPING
     total = _total(fits, usual)
@@ -268,10 +272,8 @@ def _minimised(
         steps, promised = _steps(fits, usual, damping)
         if promised < _ENOUGH:
             break
-        trial = at(
-            [fit.state.moved(step, free.tone) for fit, step in zip(fits, steps, strict=True)]
-        )
-        settled = at([fit.state.moved(_own_step(fit), free.tone) for fit in trial])
+        trial = moved(fits, steps)
+        settled = moved(trial, _own_steps(trial))
         trial = [min(pair, key=_own_total) for pair in zip(trial, settled, strict=True)]
         is_near = all(map(_is_near, trial, states))
         trial_total = _total(trial, usual) if is_near else math.inf
@@ -308,28 +310,38 @@ def _penalty(shared: FloatArray, usual: ProcessingPrior) -> float:
     return 0.5 * float(off @ usual.precision @ off)
 
 
-def _own_step(fit: DiscFit) -> FloatArray:
-    """Return a step (21,) of what is a disc's own."""
-    own = np.flatnonzero(~np.isin(fit.free.rows, _SHARED))
-    step = np.zeros(COUNT)
-    step[fit.free.rows[own]] = np.linalg.solve(fit.normal[np.ix_(own, own)], fit.gradient[own])
-    return step
+def _own_steps(fits: Sequence[DiscFit]) -> FloatArray:
+    """Return steps (k, 21) of what is each disc's own."""
+    rows = fits[0].free.rows
+    own = np.flatnonzero(~np.isin(rows, _SHARED))
+    normals = np.array([fit.normal[np.ix_(own, own)] for fit in fits])
+    gradients = np.array([fit.gradient[own] for fit in fits])
+    steps = np.zeros((len(fits), COUNT))
+    steps[:, rows[own]] = np.linalg.solve(normals, gradients[:, :, None])[:, :, 0]
+    return steps
 
 
 def _reduced(fits: Sequence[DiscFit], damping: float) -> _Reduced:
+    """Eliminate what is each disc's own."""
     is_shared = np.isin(fits[0].free.rows, _SHARED)
-    made = _Reduced(is_shared, [], [], [], [], [])
-    for fit in fits:
-        normal, gradient = fit.normal.copy(), fit.gradient
-        normal[np.diag_indices_from(normal)] *= 1.0 + damping
-        between = normal[np.ix_(is_shared, ~is_shared)]
-        inverse = np.asarray(np.linalg.inv(normal[np.ix_(~is_shared, ~is_shared)]))
-        made.normals.append(normal[np.ix_(is_shared, is_shared)] - between @ inverse @ between.T)
-        made.gradients.append(gradient[is_shared] - between @ (inverse @ gradient[~is_shared]))
-        made.inverse_others.append(inverse)
-        made.between.append(between)
-        made.own_gradients.append(gradient[~is_shared])
-    return made
+    order = np.argsort(~is_shared, kind="stable")  # what is shared first
+    count = np.count_nonzero(is_shared)
+    normals = np.array([fit.normal for fit in fits])
+    diagonal = np.arange(len(order))
+    normals[:, diagonal, diagonal] *= 1.0 + damping
+    normals = normals[:, order[:, None], order]
+    gradients = np.array([fit.gradient for fit in fits])[:, order]
+    between, own_gradients = normals[:, :count, count:], gradients[:, count:]
+    inverse = np.asarray(np.linalg.inv(normals[:, count:, count:]))
+    explained = between @ inverse
+    return _Reduced(
+        is_shared,
+        normals[:, :count, :count] - explained @ between.transpose(0, 2, 1),
+        gradients[:, :count] - (explained @ own_gradients[:, :, None])[:, :, 0],
+        inverse,
+        between,
+        own_gradients,
+    )
 
 
 def within_limits(step: FloatArray, normal: FloatArray, now: FloatArray, tone: Tone) -> FloatArray:
@@ -376,31 +388,29 @@ def within_limits(step: FloatArray, normal: FloatArray, now: FloatArray, tone: T
 
 def _steps(
     fits: Sequence[DiscFit], usual: ProcessingPrior, damping: float
-) -> tuple[list[FloatArray], float]:
-    """Return a step (21,) of every disc, and the gain that they promise together."""
+) -> tuple[FloatArray, float]:
+    """Return steps (k, 21) of all discs, and the gain that they promise together."""
     free = fits[0].free
     own = np.isin(_SHARED, free.rows)
     precision = usual.precision[np.ix_(own, own)]
     off = (usual.mean - fits[0].state.vector[_SHARED])[own]
     try:
         reduced = _reduced(fits, damping)
-        gradient = precision @ off + sum(reduced.gradients)
-        normal = precision + sum(reduced.normals)
+        gradient = precision @ off + reduced.gradients.sum(axis=0)
+        normal = precision + reduced.normals.sum(axis=0)
         shared = np.linalg.solve(normal, gradient)
         if free.tone.is_shaped:
             now = fits[0].state.vector[_SHARED][own]
             shared = within_limits(shared, normal, now, free.tone)
     except np.linalg.LinAlgError:
         raise NoFit from None
-    promised, steps = float(gradient @ shared - 0.5 * shared @ normal @ shared), []
-    for inverse, between, own_gradient in zip(
-        reduced.inverse_others, reduced.between, reduced.own_gradients, strict=True
-    ):
-        step = np.zeros(COUNT)
-        step[free.rows[reduced.is_shared]] = shared
-        step[free.rows[~reduced.is_shared]] = inverse @ (own_gradient - between.T @ shared)
-        promised += 0.5 * float(own_gradient @ inverse @ own_gradient)
-        steps.append(step)
-    if not np.isfinite(promised):
+    inverse, own_gradients = reduced.inverse_others, reduced.own_gradients
+    steps = np.zeros((len(fits), COUNT))
+    steps[:, free.rows[reduced.is_shared]] = shared
+    left = own_gradients - shared @ reduced.between
+    steps[:, free.rows[~reduced.is_shared]] = (inverse @ left[:, :, None])[:, :, 0]
+    promised = float(gradient @ shared - 0.5 * shared @ normal @ shared)
+    promised += 0.5 * float(np.einsum("ki,kij,kj->", own_gradients, inverse, own_gradients))
+    if not math.isfinite(promised):
         raise NoFit
     return steps, promised

@@ -78,7 +78,7 @@ def _step_of(size: FloatArray) -> float:
         return math.nan
     largest = min(int(np.quantile(size, 0.1) + _NONE), _LARGEST_STEP)
     steps = np.arange(1, largest + 1)
-    shown = np.array([np.mean(np.cos((2.0 * math.pi / step) * size)) for step in steps.tolist()])
+    shown = np.cos(np.outer(2.0 * math.pi / steps, size)).mean(axis=1)
     best = int(np.argmax(shown))  # of fractions of the step, rounded pixels leave less
     left = math.exp(-2.0 * math.pi**2 / (12.0 * float(steps[best]) ** 2))
     return float(steps[best]) if shown[best] > _PERIODIC * left else math.nan
