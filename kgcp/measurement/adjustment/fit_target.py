@@ -192,7 +192,7 @@ def fit_problem_of(
             centre_px=centre_px,
             focal_px=seen.mean_focal_px,
             censoring=find_censoring(window.levels, window.levels_per_count, window.width),
-            tone=apparent_tone(camera.response, window),
+            tone=apparent_tone(camera.response, window, size_px),
             sharpening_px=0.0 if is_plain else _SHARPENING_PX,
             shutter=shutter,
         )

@@ -19,6 +19,11 @@ SMALL_RING_PX = 12.5
 """Radius below which rings hardly show ink and plate beside their edges."""
 _CLIPPED = 0.002  # share of a window's pixels from which on clipping shows in bins
 _FEW_PIXELS = 400  # enough to come near the minimum, at a fraction of the time
+# Radius from which on rings show what compression makes of a stated curve. If that may bend, errors
+# of 100 rings in JPEGs fall from 0.0042 to 0.0036 px at R 26 to 40 px, and from 0.0035 to 0.0022 px
+# at R 40 to 110 px; without compression they stay as they are. Smaller rings gain nothing, and lose
+# a seventh of their accuracy where nothing is compressed.
+_BENDING_PX = 26.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,13 +58,21 @@ class FitProblem:
         return None if self.sharpening_px else _FEW_PIXELS
 
 
-def apparent_tone(response: Response, window: Window) -> Tone:
+def apparent_tone(response: Response, window: Window, radius_px: float) -> Tone:
     """Return how the grey values of a window follow light.
 
-    In means of grey values, tone curves, sharpening and clipping leave of an edge within a bin how
-    far they displace it; the tone's parameters take that.
+    Where JPEG leaves out what it takes for noise, an edge is no longer quite what sRGB's curve
+    makes of it: that is allowed for. In means of grey values, tone curves, sharpening and clipping
+    leave of an edge within a bin how far they displace it; the tone's parameters take that.
+
+    Parameters
+    ----------
+    radius_px : float
+        Of the ring.
     """
     if window.clipped is None:
+        if response is Response.SRGB and radius_px >= _BENDING_PX:
+            return Tone.NEAR_SRGB
         return Tone.of(response)
     is_clipped = float(np.mean(window.clipped)) > _CLIPPED
     return Tone.LINEAR if response is Response.LINEAR and not is_clipped else Tone.OF_BINS

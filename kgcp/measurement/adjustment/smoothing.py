@@ -22,7 +22,6 @@ from kgcp.measurement.adjustment.covariance import propagate, unevenness_factor
 from kgcp.measurement.adjustment.normal_equations import normal_matrix
 from kgcp.measurement.adjustment.solver import TargetFit
 from kgcp.measurement.image_model.edge_terms import smoothing_row
-from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.image_model.ray_plate import views_of
 from kgcp.measurement.records import ContourSmoothing, Measurement
 
@@ -43,7 +42,7 @@ def contour_smoothing(fit: TargetFit, inflation: float) -> ContourSmoothing | No
     inflation : float
         Ratio of variances to those of independent residuals.
     """
-    if fit.sample.problem.tone not in {Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE}:
+    if not fit.sample.problem.tone.is_unknown:
         return None
     row, weight = _by_smoothing(fit) / fit.sd, fit.misfit.weight
     own, score = float(row @ (row * weight)), float(row @ fit.misfit.score)

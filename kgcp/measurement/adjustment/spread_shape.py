@@ -56,7 +56,8 @@ def shape_needed(fit: TargetFit) -> list[int]:
     score, own = by_shape.score, by_shape.normal
     if score[:-1] @ np.linalg.solve(own[:-1, :-1], score[:-1]) > _SKEW_CHI2:
         return SHAPE_PARAMS
-    least = _KURTOSIS_CHI2_BY_UNKNOWN_TONE if fit.sample.problem.tone.is_shaped else _KURTOSIS_CHI2
+    is_unknown = fit.sample.problem.tone.is_unknown
+    least = _KURTOSIS_CHI2_BY_UNKNOWN_TONE if is_unknown else _KURTOSIS_CHI2
     return [int(Param.KURTOSIS)] if score[-1] ** 2 > least * own[-1, -1] else []
 
 

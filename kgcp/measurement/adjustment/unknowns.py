@@ -31,18 +31,21 @@ _PRIOR_SD = {
     Param.SHARPENING: 0.7,
     Param.LINEAR_SHARPENING: 0.3,
 }
+_STATED_TONE_SD = 0.02  # of the three shapes of a stated curve; 0.06 and 0.2 are no better
 # Of burnt plates of unknown tone: without a prior, white and tone would drift together.
 _WHITE, _WHITE_SD = 1.0, 0.4
 _ALWAYS = [*range(6), Param.BLUR_MEAN, Param.BLACK, Param.WHITE, Param.SLOPE_X, Param.SLOPE_Y]
 _GAUSSIAN = [Param.BLUR_DIFFERENCE, Param.BLUR_XY]
 _STREAK = [Param.STREAK_X, Param.STREAK_Y]
-_SHAPED = [Param.CURVATURE, Param.TONE_1, Param.TONE_2, Param.TONE_3, Param.SHARPENING]
+_TONE = [Param.TONE_1, Param.TONE_2, Param.TONE_3]
+_SHAPED = [Param.CURVATURE, *_TONE, Param.SHARPENING]
 _GRADIENT = [Param.SLOPE_X, Param.SLOPE_Y, Param.CURVATURE]
 # What levels that vary replace.
 _EVEN_LIGHT = [Param.BLACK, Param.WHITE, *_GRADIENT, Param.LINEAR_SHARPENING]
 _OF_TONE = {
     Tone.LINEAR: [],
     Tone.SRGB: [Param.SHARPENING],
+    Tone.NEAR_SRGB: [*_TONE, Param.SHARPENING],
     Tone.UNKNOWN: [*_SHAPED, Param.LINEAR_SHARPENING],
     Tone.UNKNOWN_FROM_LINE: _SHAPED,
     Tone.OF_BINS: [Param.TONE_1],  # how far edges are displaced; their shape is that of the bins
@@ -75,7 +78,9 @@ def _unknowns(tone: Tone, *, has_streak: bool, moves: bool) -> Unknowns:
     mean, precision = np.zeros(PARAM_COUNT), np.zeros(PARAM_COUNT)
     for param, sd in _PRIOR_SD.items():
         precision[param] = sd**-2 if param in free else 0.0
-    if tone.is_shaped:
+    if tone is Tone.NEAR_SRGB:
+        precision[_TONE] = _STATED_TONE_SD**-2
+    elif tone.is_shaped:
         mean[Param.WHITE], precision[Param.WHITE] = _WHITE, _WHITE_SD**-2
     estimated = np.array(sorted(free)[0 if moves else 6 :])
     return Unknowns(estimated, mean, precision, precision[estimated])

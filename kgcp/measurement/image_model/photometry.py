@@ -36,6 +36,7 @@ class Tone(Enum):
 
     LINEAR = auto()
     SRGB = auto()
+    NEAR_SRGB = auto()  # sRGB, of light that three parameters shape a little
     UNKNOWN = auto()  # sRGB, of light that three parameters shape: usual cameras are near it
     UNKNOWN_FROM_LINE = auto()  # the same over a straight line: some curves are nearer to that
     OF_BINS = auto()  # a straight line that they shape: bins leave of a curve what displaces edges
@@ -48,12 +49,18 @@ class Tone(Enum):
     @property
     def is_srgb(self) -> bool:
         """Whether sRGB's curve is applied last."""
-        return self is Tone.SRGB or self is Tone.UNKNOWN  # several times as fast as a set
+        # several times as fast as a set
+        return self is Tone.SRGB or self is Tone.NEAR_SRGB or self is Tone.UNKNOWN
 
     @property
     def is_curved(self) -> bool:
         """Whether a curve lies between light and level, so that noise does not grow evenly."""
-        return self in {Tone.SRGB, Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE}
+        return self in {Tone.SRGB, Tone.NEAR_SRGB} or self.is_unknown
+
+    @property
+    def is_unknown(self) -> bool:
+        """Whether nothing is known of the curve, which single pixels show."""
+        return self is Tone.UNKNOWN or self is Tone.UNKNOWN_FROM_LINE
 
     @property
     def is_shaped(self) -> bool:
@@ -173,7 +180,7 @@ class PhotometricModel:
     """Relation of white share to grey value, for the n pixels of one sample."""
 
     offsets: FloatArray  # (2, n): from the target's centre, in ring radii
-    # `linear` and `srgb` are applied as known; `unknown` uses the tone parameters
+    # `LINEAR` and `SRGB` are applied as known, the others use the tone parameters
     tone: Tone
     mask: Mask | None  # of the camera's sharpening; None: it does not sharpen
 

@@ -92,6 +92,13 @@ def rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
+def compressed(grey: GreyArray, quality: int) -> GreyArray:
+    _, data = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    decoded = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+    assert decoded is not None
+    return decoded.astype(np.uint8)
+
+
 @pytest.mark.parametrize(
     "optics",
     [
@@ -251,16 +258,29 @@ def test_compression_does_not_hide_that_the_plate_is_burnt(
     rng = np.random.default_rng(seed)
     pose = random_pose(camera, radius_px, rng)
     grey = photograph(camera, pose, rng, sensor=FILM, gain=gain)
-    _, data = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, 92])
-    decoded = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
-    assert decoded is not None
-    smeared = decoded.astype(np.uint8)
+    smeared = compressed(grey, 92)
     seen = measure_by_model(smeared, camera, TARGET, start_near(camera, pose, rng))
     assert seen.appearance.saturated > 0.15
     assert seen.uncertainty is not None
     assert 100.0 * seen.uncertainty.sd_distance_m / pose.distance_m < percent
     error_m = abs(seen.pose.distance_m - pose.distance_m)
     assert error_m < 4.0 * seen.uncertainty.sd_distance_m
+
+
+def test_compression_displaces_no_edges_of_a_stated_curve(
+    photograph: Photograph, start_near: StartNear
+) -> None:
+    """What it leaves of an edge is not quite sRGB's: rings were 0.0055 px too large, by 1.5 σ."""
+    camera, sigmas = replace(LENS, response=Response.SRGB), []
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        pose = random_pose(camera, 50.0, rng)
+        grey = photograph(camera, pose, rng, sensor=Sensor(tone=ToneCurve.SRGB), gain=0.7)
+        start = start_near(camera, pose, rng)
+        seen = measure_by_model(compressed(grey, 75), camera, TARGET, start)
+        sigmas.append(standardised(camera, seen, pose)[1])
+    assert -0.7 < np.mean(sigmas) < 0.7
+    assert 0.5 < rms(np.array(sigmas)) < 1.4
 
 
 def test_both_poses_are_reported_whichever_the_start(
