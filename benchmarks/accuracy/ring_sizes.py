@@ -4,10 +4,11 @@ Usage: python -m benchmarks.accuracy.ring_sizes [--size small] [--frames 60] [--
 
 Small rings have radii of 7 to 13 px and show little of ink and plate beside their edges; middle
 ones have 37 to 140 px; large ones have 150 to 290 px and are seen in bins, or in some of their
-pixels. Each line is a camera of a preset of `kgcp simulate` and a kind of light: how many of the
-targets are measured, the RMS error of the distance, its mean and RMS standardised, how many are off
-by more than three standard deviations, the RMS standardised error of the centre, and the median
-CPU time of a frame. With `--quality`, frames are compressed as JPEG; `--astigmatism`, `--coma` and
+pixels. Each line is a camera and a kind of light: how many of the targets are measured, the RMS
+error of the distance, its mean and RMS standardised, how many are off by more than three standard
+deviations, the RMS standardised error of the centre, and the median CPU time of a frame. The
+cameras are those of presets of `kgcp simulate`, and `srgb`, that of `clean` with sRGB's curve,
+which is stated. With `--quality`, frames are compressed as JPEG; `--astigmatism`, `--coma` and
 `--defocus` are those of `kgcp simulate`.
 """
 
@@ -23,6 +24,7 @@ import numpy as np
 
 from benchmarks.pool import ordered_map
 from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Response
 from kgcp.measurement.frame import examine
 from kgcp.measurement.records import Measurement
 from kgcp.pipeline.execution.resilient_map import usable_cores
@@ -36,11 +38,21 @@ from kgcp.simulation.flight import (
     plan_flight,
     render_frame,
 )
+from kgcp.simulation.imaging import ToneCurve
 from kgcp.simulation.light_settings import Dirt, Glare, Shadow
 from kgcp.simulation.point_spread import Aberration
 from kgcp.simulation.presets import SimulationSettings, preset
 
-_CAMERAS = ("clean", "consumer")
+_CLEAN = preset("clean")
+_CAMERAS = {
+    "clean": _CLEAN,
+    "srgb": replace(
+        _CLEAN,
+        camera=replace(_CLEAN.camera, response=Response.SRGB),
+        sensor=replace(_CLEAN.sensor, tone=ToneCurve.SRGB),
+    ),
+    "consumer": preset("consumer"),
+}
 _LIGHTS: dict[str, dict[str, object]] = {
     "even": {},
     "burnt": {"gain": (1.15, 2.2)},
@@ -71,7 +83,7 @@ def settings_of(
     camera: str, light: str, frames: int, size: Size = SIZES["small"], quality: int | None = None
 ) -> SimulationSettings:
     """Return a flight of frames that are not much larger than the target in each of them."""
-    chosen = preset(camera)
+    chosen = _CAMERAS[camera]
     (width, height), (cx, cy) = size.frame_px, size.principal_point_px
     return replace(
         chosen,
@@ -142,6 +154,14 @@ def errors_of(settings: SimulationSettings, seed: int, jobs: int = 1) -> RingErr
 
 @click.command()
 @click.option("--size", type=click.Choice(list(SIZES)), default="small", show_default=True)
+@click.option(
+    "--camera",
+    "cameras",
+    type=click.Choice(list(_CAMERAS)),
+    multiple=True,
+    default=("clean", "consumer"),
+    show_default=True,
+)
 @click.option("--frames", type=click.IntRange(2), default=60, show_default=True, help="Per line.")
 @click.option("--quality", type=click.IntRange(1, 100), default=None, help="Of JPEG.")
 @click.option("--astigmatism", type=click.FloatRange(1.0, 5.0), default=1.0, help="Of the lens.")
@@ -151,6 +171,7 @@ def errors_of(settings: SimulationSettings, seed: int, jobs: int = 1) -> RingErr
 @click.option("--jobs", type=click.IntRange(1, 256), default=None)
 def main(
     size: str,
+    cameras: tuple[str, ...],
     frames: int,
     quality: int | None,
     astigmatism: float,
@@ -163,7 +184,7 @@ def main(
     aberration = Aberration(astigmatism=astigmatism, coma=coma, defocus_px=defocus)
     lens = None if aberration == Aberration() else aberration
     print("camera    light             found  error [%]  z mean   z RMS  > 3  z of centre  ms")
-    for camera in _CAMERAS:
+    for camera in cameras:
         for light in _LIGHTS:
             settings = settings_of(camera, light, frames, SIZES[size], quality)
             errors = errors_of(replace(settings, lens=lens), seed, jobs or usable_cores())

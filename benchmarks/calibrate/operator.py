@@ -64,6 +64,7 @@ class Case:
 CASES = {
     "linear": Case(ToneCurve.LINEAR, Response.LINEAR, 1.15),
     "srgb": Case(ToneCurve.SRGB, Response.SRGB, 1.3),
+    "srgb_jpeg": Case(ToneCurve.SRGB, Response.SRGB, 2.5, quality=85),
     "clipped": Case(ToneCurve.LINEAR, Response.LINEAR, 1.6, gain=1.5 / _BRIGHT),
     "clipped_srgb": Case(ToneCurve.SRGB, Response.SRGB, 1.6, gain=1.5 / _BRIGHT),
     "unknown_srgb": Case(ToneCurve.SRGB, Response.UNKNOWN, 1.5),

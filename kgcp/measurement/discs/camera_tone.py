@@ -83,6 +83,7 @@ _KURTOSIS_STEP, _DEFOCUSED_STEP, _MOST_KURTOSIS_STEPS = 0.2, -3.0, 3
 # have 23 and 30 (`benchmarks.calibrate.operator`).
 _WORTHY_KURTOSIS, _WORTHY_IN_COMPRESSED = 16.0, 100.0
 _LITTLE_BENT = 0.02  # standard deviation of the waves of a curve that is not bent
+_NEAR_PX, _BLOCK_PX = 256, 8  # where JPEG is looked for, about a disc, from whole blocks on
 # Of χ² with so many degrees of freedom; with none, discs share nothing to contradict each other in.
 _MEDIAN_SQUARE = {0: 1.0, 1: 0.455, 4: 3.357}
 
@@ -107,7 +108,8 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     is burnt and black sunk, little of the curve is seen, and its bends explain what the model of
     the image lacks. Then the width of the mask is adjusted, where the camera sharpens. If the curve
     that is likeliest so far says that the camera is out of focus, all are compared once more with
-    the kurtosis of such a point spread.
+    the kurtosis of such a point spread. A curve that is stated may bend a little in each disc where
+    photographs are compressed.
     """
     tone = Tone.of(response)
     chosen = [task for tasks in photographs for task in _to_learn_from(tasks)]
@@ -138,8 +140,10 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
         is_reliable = best.is_settled and not _are_coarse(steps)
     blur_px = float(np.median([fit.state.blur.mean_sd_px for fit in best.fits]))
     known = _known_by(best)
-    if tone is Tone.UNKNOWN and not best.tone.is_shaped:
-        # what an unknown curve may be off stays in the covariances
+    may_bend = tone is Tone.UNKNOWN or _is_compressed_near(best.fits)
+    if may_bend and not best.tone.is_shaped:
+        # what an unknown curve may be off stays in the covariances; so does what compression makes
+        # of a stated one, by which radii would be off by five deviations
         known = _without_bends(known)
         best = replace(best, tone=_BENT[best.tone])
     return CameraTone(best.tone, best.sharpening_px, known, blur_px, kurtosis, is_reliable)
@@ -405,6 +409,21 @@ def _steps_of(fits: Sequence[DiscFit]) -> list[FloatArray | None]:
     photos = {id(fit.sample.window.photo): fit.sample.window.photo for fit in fits}
     steps = {key: quantisation_steps(photo) for key, photo in photos.items()}
     return [steps[id(fit.sample.window.photo)] for fit in fits]
+
+
+def _is_compressed_near(fits: Sequence[DiscFit]) -> bool:
+    """Return whether JPEG compressed a photograph, as far as one of its discs' surroundings show.
+
+    Of a whole photograph, that takes longer than to measure a disc.
+    """
+    first = {id(fit.sample.window.photo): fit for fit in reversed(fits)}
+    for fit in first.values():
+        centre = fit.state.geometry[:2].astype(np.intp)
+        left, top = np.maximum(centre - _NEAR_PX, 0) // _BLOCK_PX * _BLOCK_PX
+        photo = fit.sample.window.photo[top : top + 2 * _NEAR_PX, left : left + 2 * _NEAR_PX]
+        if quantisation_steps(photo) is not None:
+            return True
+    return False
 
 
 def _are_coarse(steps: Sequence[FloatArray | None]) -> bool:
