@@ -36,7 +36,7 @@ from kgcp.measurement.discs.fit_disc import (
 )
 from kgcp.measurement.discs.joint_tone import JointFit, adjust_before_compression, adjust_together
 from kgcp.measurement.discs.tone_curve import WAVES
-from kgcp.measurement.image_model.compression import quantisation_steps
+from kgcp.measurement.image_model.compression import is_compressed_near, quantisation_steps
 from kgcp.measurement.image_model.photometry import Tone
 
 # Discs of a photograph to learn from: as many as have so long an edge together, as a sum of radii,
@@ -83,7 +83,6 @@ _KURTOSIS_STEP, _DEFOCUSED_STEP, _MOST_KURTOSIS_STEPS = 0.2, -3.0, 3
 # have 23 and 30 (`benchmarks.calibrate.operator`).
 _WORTHY_KURTOSIS, _WORTHY_IN_COMPRESSED = 16.0, 100.0
 _LITTLE_BENT = 0.02  # standard deviation of the waves of a curve that is not bent
-_NEAR_PX, _BLOCK_PX = 256, 8  # where JPEG is looked for, about a disc, from whole blocks on
 # Of χ² with so many degrees of freedom; with none, discs share nothing to contradict each other in.
 _MEDIAN_SQUARE = {0: 1.0, 1: 0.455, 4: 3.357}
 
@@ -140,7 +139,7 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
         is_reliable = best.is_settled and not _are_coarse(steps)
     blur_px = float(np.median([fit.state.blur.mean_sd_px for fit in best.fits]))
     known = _known_by(best)
-    may_bend = tone is Tone.UNKNOWN or _is_compressed_near(best.fits)
+    may_bend = tone is Tone.UNKNOWN or _are_compressed(best.fits)
     if may_bend and not best.tone.is_shaped:
         # what an unknown curve may be off stays in the covariances; so does what compression makes
         # of a stated one, by which radii would be off by five deviations
@@ -411,19 +410,13 @@ def _steps_of(fits: Sequence[DiscFit]) -> list[FloatArray | None]:
     return [steps[id(fit.sample.window.photo)] for fit in fits]
 
 
-def _is_compressed_near(fits: Sequence[DiscFit]) -> bool:
-    """Return whether JPEG compressed a photograph, as far as one of its discs' surroundings show.
-
-    Of a whole photograph, that takes longer than to measure a disc.
-    """
+def _are_compressed(fits: Sequence[DiscFit]) -> bool:
+    """Return whether a photograph is compressed, as far as it shows around one of its discs."""
     first = {id(fit.sample.window.photo): fit for fit in reversed(fits)}
-    for fit in first.values():
-        centre = fit.state.geometry[:2].astype(np.intp)
-        left, top = np.maximum(centre - _NEAR_PX, 0) // _BLOCK_PX * _BLOCK_PX
-        photo = fit.sample.window.photo[top : top + 2 * _NEAR_PX, left : left + 2 * _NEAR_PX]
-        if quantisation_steps(photo) is not None:
-            return True
-    return False
+    return any(
+        is_compressed_near(fit.sample.window.photo, fit.state.geometry[:2])
+        for fit in first.values()
+    )
 
 
 def _are_coarse(steps: Sequence[FloatArray | None]) -> bool:

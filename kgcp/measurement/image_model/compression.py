@@ -25,6 +25,7 @@ _Pixel = TypeVar("_Pixel", bound=np.generic)
 _SIDE, _WHITE = 8, 255.0  # of a block; of 8 bits
 _MOST_BLOCKS, _FEWEST_BLOCKS = 4000, 30  # the least even ones, to read the steps from, …
 _LEAST_RANGE = 24  # … of so many grey values at least
+_NEAR_PX = 256  # about a place, in every direction: 1000 to 4000 blocks
 _NONE = 1.4  # coefficients up to here may be zero: rounded pixels leave a deviation of 0.29
 _FEWEST_COEFFICIENTS = 20
 _LARGEST_STEP = 255
@@ -69,6 +70,16 @@ def quantisation_steps(grey: GreyArray) -> FloatArray | None:
     known = np.where(seen, steps, 1.0).reshape(_SIDE, _SIDE)
     lower = np.maximum.accumulate(np.maximum.accumulate(known, axis=0), axis=1)
     return np.where(seen.reshape(_SIDE, _SIDE), known, lower)
+
+
+def is_compressed_near(grey: GreyArray, centre_px: FloatArray) -> bool:
+    """Return whether JPEG compressed a photograph, as far as it shows around a place (2,).
+
+    Of a whole photograph, that takes longer than to measure a disc.
+    """
+    left, top = np.maximum(centre_px.astype(np.intp) - _NEAR_PX, 0) // _SIDE * _SIDE
+    near = grey[top : top + 2 * _NEAR_PX, left : left + 2 * _NEAR_PX]
+    return quantisation_steps(near) is not None
 
 
 def _step_of(size: FloatArray) -> float:
