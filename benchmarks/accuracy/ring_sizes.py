@@ -161,6 +161,7 @@ def errors_of(settings: SimulationSettings, seed: int, jobs: int = 1) -> RingErr
     multiple=True,
     default=("clean", "consumer"),
     show_default=True,
+    help="One or more.",
 )
 @click.option("--frames", type=click.IntRange(2), default=60, show_default=True, help="Per line.")
 @click.option("--quality", type=click.IntRange(1, 100), default=None, help="Of JPEG.")

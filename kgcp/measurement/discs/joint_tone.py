@@ -322,7 +322,7 @@ def _own_steps(fits: Sequence[DiscFit]) -> FloatArray:
 
 
 def _reduced(fits: Sequence[DiscFit], damping: float) -> _Reduced:
-    """Eliminate what is each disc's own."""
+    """Eliminate what is each disc's own. All have the same unknowns."""
     is_shared = np.isin(fits[0].free.rows, _SHARED)
     order = np.argsort(~is_shared, kind="stable")  # what is shared first
     count = np.count_nonzero(is_shared)

@@ -267,9 +267,8 @@ def test_radii_by_a_stated_curve_are_as_good_as_they_say() -> None:
         photo = compressed(Sensor(tone=ToneCurve.SRGB).expose(light, 1.0, rng), 85)
         for disc in measure_discs(photo, find_outlines(photo), response=Response.SRGB):
             assert isinstance(disc, Disc)
-            off = (
-                disc.vector - truth[np.linalg.norm(truth[:, :2] - disc.centre_px, axis=1).argmin()]
-            )
-            z.append(of_size @ off / np.sqrt(of_size @ disc.cov @ of_size))
+            own = np.linalg.norm(truth[:, :2] - disc.centre_px, axis=1).argmin()
+            off = of_size @ (disc.vector - truth[own])
+            z.append(off / np.sqrt(of_size @ disc.cov @ of_size))
     assert len(z) == 50
     assert 0.3 < np.sqrt(np.mean(np.square(z))) < 1.3
