@@ -13,7 +13,6 @@ import tempfile
 import warnings
 import zlib
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import replace
 from datetime import date
 from functools import partial
@@ -287,9 +286,14 @@ def feed_in_new_folder(target: str, data: bytes) -> None:
 
 
 def _allow(read: Callable[[], object]) -> None:
-    """Call a reader, which may raise known errors."""
-    with suppress(KgcpError, Rejection):
+    """Call a reader, which may raise known errors: those of files say what is wrong in one line."""
+    try:
         read()
+    except KgcpError as error:
+        if len(str(error).splitlines()) != 1:
+            raise AssertionError(f"{error!r} is not one line") from error
+    except Rejection:
+        pass
 
 
 def _written(folder: Path, data: bytes) -> Path:

@@ -68,7 +68,7 @@ def test_damage_is_a_known_error(target: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("path", KEPT, ids=lambda path: f"{path.parent.name}/{path.name}")
 def test_what_was_found_stays_repaired(path: Path) -> None:
-    """A reader must accept a file or refuse it by a `KgcpError`; any other exception fails."""
+    """A reader accepts a file, or refuses it in one line; any other exception fails."""
     feed_in_new_folder(path.parent.name, path.read_bytes())
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -24,6 +23,7 @@ from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Sensor, ToneCurve
+from tests.measurement.jpeg import compressed
 
 CAMERA = Camera(753, 610, 1206.0, 1202.0, 381.3, 296.8, k1=-0.072, k2=0.055, p1=0.0004, p2=-0.0003)
 RADIUS_M = 0.5 * TARGET_PLATE.target.ring.outer_diameter_m
@@ -137,9 +137,7 @@ def test_compression_of_large_rings_is_not_taken_for_uneven_light() -> None:
     rng = np.random.default_rng(8)
     for _ in range(4):
         shot = shoot(Response.UNKNOWN, 1.1, rng)
-        _, jpeg = cv2.imencode(".jpg", shot.grey, (cv2.IMWRITE_JPEG_QUALITY, 90))
-        decoded = np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE))
-        found = replace(shot, grey=decoded).measured()
+        found = replace(shot, grey=compressed(shot.grey, 90)).measured()
         assert found.uncertainty is not None
         off = found.pose.distance_m / shot.pose.distance_m - 1.0
         sd = found.uncertainty.sd_distance_m / shot.pose.distance_m

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -17,6 +16,7 @@ from kgcp.measurement.adjustment.fit_target import measure_by_model
 from kgcp.measurement.records import InitialPose
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Sensor, ToneCurve
+from tests.measurement.jpeg import compressed
 
 LENS = Camera(420, 340, 900.0, 901.0, 208.2, 171.7)
 
@@ -43,13 +43,8 @@ def test_compressed_burnt_plates_are_measured_as_well_as_others(
         rotation = Rotation.from_rotvec(np.radians([*rng.uniform(-12.0, 12.0, 2), 71.0]))
         pose = Pose(rotation.as_matrix(), ray * 0.45 * camera.mean_focal_px / radius_px)
         grey = photograph(camera, pose, rng, sensor=sensor, gain=2.0)
-        _, jpeg = cv2.imencode(".jpg", grey, (cv2.IMWRITE_JPEG_QUALITY, 82))
-        seen = measure_by_model(
-            np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)),
-            camera,
-            TARGET_PLATE.target,
-            start_near(camera, pose, rng),
-        )
+        start = start_near(camera, pose, rng)
+        seen = measure_by_model(compressed(grey, 82), camera, TARGET_PLATE.target, start)
         assert seen.uncertainty is not None
         off_m = seen.pose.distance_m - pose.distance_m
         assert abs(off_m) < 0.01 * percent * pose.distance_m

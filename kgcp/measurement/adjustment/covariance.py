@@ -23,7 +23,6 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.normal_equations import normal_matrix
-from kgcp.measurement.adjustment.problem import SMALL_RING_PX
 from kgcp.measurement.adjustment.solver import TargetFit, noise_of
 from kgcp.measurement.adjustment.spread_shape import (
     SHAPE_PRECISIONS,
@@ -137,7 +136,8 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
     if fit.parameters.has_kurtosis:
         shift = _shift_by_kurtosis(fit, inverse, mean)
         pose_cov += np.outer(shift, shift)
-    if _is_of_small_ring(fit) and not fit.unknowns.has_shape and fit.level_equations is None:
+    is_small = fit.sample.problem.is_ring_small
+    if is_small and not fit.unknowns.has_shape and fit.level_equations is None:
         pose_cov += _by_shape_left_out(equations_by_shape(fit, scaled, normal), max(1.0, mean))
     shutter = fit.sample.problem.shutter
     if shutter is not None:
@@ -151,7 +151,7 @@ def unevenness_factor(fit: TargetFit, inflation: float) -> float:
     Only those of small rings are. If levels do not vary there, an `inflation` beyond 1 says that
     the light may be uneven.
     """
-    if not _is_of_small_ring(fit):
+    if not fit.sample.problem.is_ring_small:
         return 1.0
     if fit.parameters.field is not None:
         return _ON_SMALL_RINGS
@@ -214,10 +214,6 @@ def _by_shape_left_out(by_shape: ShapeEquations, inflation: float) -> FloatArray
         shift = by_shape.displacement[:6, part] @ seen[part]
         added += share * np.outer(shift, shift)
     return added
-
-
-def _is_of_small_ring(fit: TargetFit) -> bool:
-    return fit.sample.problem.outer_radius_px < SMALL_RING_PX
 
 
 def common_displacement_px(fit: TargetFit, share_along_arcs: float) -> float:

@@ -28,7 +28,7 @@ from kgcp.measurement.adjustment.plateaus import (
     look_at_plateaus,
     step_across,
 )
-from kgcp.measurement.adjustment.problem import SMALL_RING_PX, FitProblem
+from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.random_levels import (
     chi2_with_levels,
     even_field,
@@ -186,7 +186,7 @@ def _may_be_even(plain: TargetFit, varying: TargetFit) -> bool:
 
     If they explain less, their fit has ended beside its minimum and says nothing.
     """
-    if plain.sample.problem.outer_radius_px >= SMALL_RING_PX:
+    if not plain.sample.problem.is_ring_small:
         return False
     return 0.0 <= advantage_over(plain, varying) < _LEAST_ADVANTAGE_IN_SMALL_RING
 

@@ -21,8 +21,8 @@ _CLIPPED = 0.002  # share of a window's pixels from which on clipping shows in b
 _FEW_PIXELS = 400  # enough to come near the minimum, at a fraction of the time
 # Radius from which on rings show what compression makes of a stated curve. If that may bend, errors
 # of 100 rings in JPEGs fall from 0.0042 to 0.0036 px at R 26 to 40 px, and from 0.0035 to 0.0022 px
-# at R 40 to 110 px; without compression they stay as they are. Smaller rings gain nothing, and lose
-# a seventh of their accuracy where nothing is compressed.
+# at R 40 to 110 px; without compression they stay as they are. Smaller rings gain little, and their
+# errors grow by some 15 % where nothing is compressed.
 _BENDING_PX = 26.0
 
 
@@ -51,6 +51,11 @@ class FitProblem:
     most_pixels: int | None = None  # that take part; None: all that are useful
     # whether bins that need levels that vary are to end in `UnevenLightInBins`
     may_be_finer: bool = False
+
+    @property
+    def is_ring_small(self) -> bool:
+        """Whether the ring hardly shows ink and plate beside its edges."""
+        return self.outer_radius_px < SMALL_RING_PX
 
     @property
     def few_pixels(self) -> int | None:

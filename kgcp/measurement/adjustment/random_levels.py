@@ -30,7 +30,7 @@ from kgcp.measurement.adjustment.normal_equations import (
 )
 from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.adjustment.pixels import NEAR_SIGMAS, Sample, select_pixels
-from kgcp.measurement.adjustment.problem import SMALL_RING_PX, FitProblem
+from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.solver import (
     PredictedImage,
     TargetFit,
@@ -137,7 +137,7 @@ def needs_varying_levels(fit: TargetFit) -> bool:
     excess, is_binned = excess_of_cells(fit), fit.sample.problem.window.binning > 1
     if excess > (_UNEVEN_EXCESS_OF_BINS if is_binned else _UNEVEN_EXCESS):
         return True
-    is_small = fit.sample.problem.outer_radius_px < SMALL_RING_PX
+    is_small = fit.sample.problem.is_ring_small
     doubtful, inflation = _DOUBTFUL_IN_SMALL_RING if is_small else _DOUBTFUL
     return excess > doubtful and not is_binned and pose_covariance(fit).inflation > inflation
 

@@ -49,7 +49,7 @@ class Tone(Enum):
     @property
     def is_srgb(self) -> bool:
         """Whether sRGB's curve is applied last."""
-        # several times as fast as a set
+        # comparing one by one is several times as fast as a set
         return self is Tone.SRGB or self is Tone.NEAR_SRGB or self is Tone.UNKNOWN
 
     @property
@@ -59,7 +59,7 @@ class Tone(Enum):
 
     @property
     def is_unknown(self) -> bool:
-        """Whether nothing is known of the curve, which single pixels show."""
+        """Whether nothing is known of the curve, and single pixels are seen through it."""
         return self is Tone.UNKNOWN or self is Tone.UNKNOWN_FROM_LINE
 
     @property

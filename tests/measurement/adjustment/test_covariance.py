@@ -61,7 +61,7 @@ def test_uneven_light_makes_variances_larger_than_residuals_show(
     field = None if edges is None else SimpleNamespace(edges=[0.0] * edges)
     fit: Any = SimpleNamespace(
         parameters=SimpleNamespace(field=field),
-        sample=SimpleNamespace(problem=SimpleNamespace(outer_radius_px=radius_px)),
+        sample=SimpleNamespace(problem=SimpleNamespace(is_ring_small=radius_px < 12.5)),
     )
     assert unevenness_factor(fit, inflation) == pytest.approx(expected)
 

@@ -88,7 +88,7 @@ def test_cells_ask_for_levels_and_edges_where_cells_leave_a_doubt(
     monkeypatch.setattr(random_levels, "excess_of_cells", lambda _: excess)
     monkeypatch.setattr(random_levels, "pose_covariance", lambda _: stand_in(inflation=inflation))
     window = stand_in(binning=binning)
-    problem = stand_in(window=window, outer_radius_px=radius_px)
+    problem = stand_in(window=window, is_ring_small=radius_px < 12.5)
     fit = stand_in(sample=stand_in(problem=problem))
     assert needs_varying_levels(fit) == is_asked
 
@@ -106,7 +106,7 @@ def test_cells_ask_for_levels_and_edges_where_cells_leave_a_doubt(
 def test_small_rings_are_in_even_light_where_levels_explain_little_more(
     monkeypatch: pytest.MonkeyPatch, *, radius_px: float, advantage: float, is_even: bool
 ) -> None:
-    problem = stand_in(outer_radius_px=radius_px, may_be_finer=False, tone=Tone.LINEAR)
+    problem = stand_in(is_ring_small=radius_px < 12.5, may_be_finer=False, tone=Tone.LINEAR)
     plain, varying = (stand_in(best=stand_in(sample=stand_in(problem=problem))) for _ in range(2))
     monkeypatch.setattr(extensions, "fit_both_poses", lambda *_: plain)
     monkeypatch.setattr(extensions, "_with_shape", lambda _, poses: poses)
@@ -124,7 +124,7 @@ def test_small_rings_are_in_even_light_where_levels_explain_little_more(
 def test_bins_in_nearly_even_light_keep_the_levels_that_they_were_fitted_with(
     monkeypatch: pytest.MonkeyPatch, *, tone: Tone, starts_from_seen: bool
 ) -> None:
-    problem = stand_in(outer_radius_px=200.0, may_be_finer=False, tone=tone)
+    problem = stand_in(is_ring_small=False, may_be_finer=False, tone=tone)
     plain = stand_in(best=stand_in(sample=stand_in(problem=problem)))
     seen, started_from = stand_in(is_uneven=False), []
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -27,6 +26,7 @@ from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 from kgcp.simulation.light_field import Cloud, PlateLight
 from kgcp.simulation.light_settings import Dirt
 from kgcp.simulation.point_spread import Aberration
+from tests.measurement.jpeg import compressed
 from tests.measurement.lens import LENS
 
 Photograph = Callable[..., GreyArray]
@@ -90,13 +90,6 @@ def standardised(camera: Camera, seen: Measurement, truth: Pose) -> tuple[float,
 
 def rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-def compressed(grey: GreyArray, quality: int) -> GreyArray:
-    _, data = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    decoded = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
-    assert decoded is not None
-    return decoded.astype(np.uint8)
 
 
 @pytest.mark.parametrize(

@@ -37,6 +37,7 @@ from kgcp.simulation.disc_field import (
     field_irradiance,
 )
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
+from tests.measurement.jpeg import compressed
 
 FILM = Sensor(tone=ToneCurve.FILM, sharpening=0.5)
 # of the standard's table for grey values, which libjpeg scales by the quality
@@ -71,12 +72,6 @@ def discs_on_a_grid(blur_px: float, noise: float) -> GreyArray:
         cv2.circle(discs, [round(16 * each) for each in place], 16 * 9, 50.0, -1, shift=4)
     blurred = cv2.GaussianBlur(discs, (0, 0), blur_px)
     return np.rint(blurred + rng.normal(0.0, noise, discs.shape)).astype(np.uint8)
-
-
-def compressed(grey: GreyArray, quality: int) -> GreyArray:
-    """Return what JPEG leaves."""
-    _, buffer = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return np.asarray(cv2.imdecode(buffer, cv2.IMREAD_GRAYSCALE))
 
 
 @pytest.mark.parametrize("quality", [80, 92])

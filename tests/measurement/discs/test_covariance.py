@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
@@ -34,6 +33,7 @@ from kgcp.simulation.disc_field import (
     photograph,
 )
 from kgcp.simulation.imaging import Optics, Sensor
+from tests.measurement.jpeg import compressed
 
 ARCS = 10
 
@@ -118,9 +118,7 @@ def test_jpegs_blocks_show_how_much_of_its_errors_cancels() -> None:
             SimulatedDisc((x, y, 0.0), 10.0 / 2e5, 0.0, tilt) for x, y in middles.tolist()
         )
         scene = FieldScene(discs, 0.62, 0.1)
-        photo = photograph(camera, pose, scene, Optics(0.6), Sensor(), rng)
-        _, coded = cv2.imencode(".jpg", photo, [cv2.IMWRITE_JPEG_QUALITY, 92])
-        photo = np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.uint8)
+        photo = compressed(photograph(camera, pose, scene, Optics(0.6), Sensor(), rng), 92)
         truth = circle_images(camera, field_circles(pose, discs)).moments
         for image, sds in ((photo, stated), (photo[4:, 4:].copy(), aside)):
             outcomes = measure_discs(image, find_outlines(image), response=Response.LINEAR)
