@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +14,11 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.fit_target import measure_by_model
+from kgcp.measurement.adjustment.pixels import Sample, select_pixels
 from kgcp.measurement.records import InitialPose
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Sensor, ToneCurve
+from kgcp.simulation.light_field import PlateLight, Shade
 from tests.measurement.jpeg import compressed
 
 LENS = Camera(420, 340, 900.0, 901.0, 208.2, 171.7)
@@ -50,3 +53,29 @@ def test_compressed_burnt_plates_are_measured_as_well_as_others(
         assert abs(off_m) < 0.01 * percent * pose.distance_m
         standardised.append(off_m / seen.uncertainty.sd_distance_m)
     assert np.abs(standardised).max() < 3.5
+
+
+def test_white_burnt_in_the_light_hides_nothing(
+    photograph: Callable[..., GreyArray],
+    start_near: Callable[..., InitialPose],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Clipped white is darker than the light on it says; it was taken for what hides the plate."""
+    shares = []
+
+    def select(*asked: Any, **more: Any) -> Sample:  # noqa: ANN401 - whatever it is asked
+        sample = select_pixels(*asked, **more)
+        shares.append(np.mean(sample.pixels[0] > 208.0))
+        return sample
+
+    monkeypatch.setattr("kgcp.measurement.adjustment.random_levels.select_pixels", select)
+    camera, rng = replace(LENS, response=Response.LINEAR), np.random.default_rng(7)
+    ray = np.append(camera.undistort(np.array([208.0, 170.0])), 1.0)
+    pose = Pose(np.eye(3), ray * 0.45 * camera.mean_focal_px / 46.0)
+    half = PlateLight(light_left=0.5, shades=(Shade((1.0, 0.0), 50.0, 100.0, 0.05),))
+    grey = photograph(camera, pose, rng, gain=1.8, field=half)
+    start = start_near(camera, pose, rng)
+    seen = measure_by_model(grey, camera, TARGET_PLATE.target, start)
+    assert seen.distance_m == pytest.approx(pose.distance_m, rel=2e-4)
+    assert shares == pytest.approx([0.5] * len(shares), abs=0.05)
+    assert len(shares) >= 1

@@ -6,7 +6,6 @@ The plain model is fitted first. If its residuals need no extension, its result 
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -14,6 +13,7 @@ from functools import cache, partial
 import numpy as np
 
 from kgcp.errors import Reason, Rejection
+from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.acceptance import check_code
 from kgcp.measurement.adjustment.appearance import TONE_OF_BASE
@@ -26,7 +26,7 @@ from kgcp.measurement.adjustment.plateaus import (
     evened_window,
     field_of,
     look_at_plateaus,
-    step_across,
+    shadows_across,
 )
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.random_levels import (
@@ -45,6 +45,8 @@ from kgcp.measurement.adjustment.two_poses import TwoPoses, fit_at, fit_both_pos
 from kgcp.measurement.adjustment.unknowns import unknowns_of, without_even_light
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.image_model.photometry import PARAM_COUNT, Light, Param, Tone, decoded
+from kgcp.measurement.image_model.seen_shadows import SeenShadows
+from kgcp.measurement.image_model.shadow_edges import INK
 from kgcp.measurement.records import ToneBase
 
 _NUDGE = 1e-6  # without any skew or kurtosis, their derivatives are left out
@@ -57,6 +59,7 @@ _OFF_MINIMUM_INFLATION = 3.0
 # levels explained better, four gained 9 to 19, and their errors grew from 0.04 to 0.06 %. Of 200
 # fits in uneven light, six gained less than 25; none was more than 2.3 σ off in even light.
 _LEAST_ADVANTAGE_IN_SMALL_RING = 25.0
+_MOST_BURNT = 3.0  # brightest white that is started from, of what is seen of it
 
 
 class UnevenLightInBins(Exception):  # noqa: N818 - the outcome of one fit
@@ -268,20 +271,37 @@ def _with_levels(problem: FitProblem, poses: TwoPoses, plateaus: Plateaus | None
     light = Light(black, white)
     field = field_of(even_field(problem), problem, plateaus, light)
     smooth = replace(Parameters.of(first.pose, first.blur, light), field=field)
-    return _fitted(problem, poses, [*_shadow_across(problem, first, plateaus), smooth])
+    shadows = reversed(shadows_across(problem, plateaus))
+    edged = [_under_shadows(problem, first, seen) for seen in shadows]
+    return _fitted(problem, poses, [*edged, smooth])
 
 
-def _shadow_across(problem: FitProblem, first: Parameters, plateaus: Plateaus) -> list[Parameters]:
-    """Return the start with a shadow's straight edge across the plate, if there may be one."""
-    step = step_across(problem, plateaus)
-    if step is None:
-        return []
-    lit, shaded = (decoded(levels, problem.tone) for levels in (step.lit, step.shaded))
-    light = Light(float(lit[0]), float(lit[1]))
-    darker = (shaded - lit) / (light.white - light.black)
-    edge = np.array((step.angle, step.offset_px, math.log(step.width_px), *darker))
-    edged = Parameters.of(first.pose, first.blur, light)
-    return [replace(edged, field=replace(even_field(problem), edges=edge[None]))]
+def _under_shadows(problem: FitProblem, first: Parameters, seen: SeenShadows) -> Parameters:
+    """Return the start with straight edges of shadows across the plate."""
+    rows = seen.edges.rows.copy()
+    # a strip's second edge adds back what the first one takes
+    falls = rows[:, INK:].sum(axis=1, keepdims=True) < 0.0
+    steps = np.where(falls, rows[:, INK:], -rows[:, INK:])
+    beyond = decoded(np.maximum(seen.lit + steps, 0.0), problem.tone)
+    ink, plate = decoded(seen.lit, problem.tone).tolist()
+    # by a curve that is not known, the white that is seen is the scale
+    if seen.is_burnt(problem.censoring.high) and not problem.tone.is_unknown:
+        plate = _burnt_white(ink, plate, beyond)
+    steps = (beyond - (ink, plate)) / (plate - ink)
+    rows[:, INK:] = np.where(falls, steps, -steps)
+    field = replace(even_field(problem), shadows=replace(seen.edges, rows=rows))
+    light = Light(ink, plate)
+    return replace(Parameters.of(first.pose, first.blur, light), field=field)
+
+
+def _burnt_white(ink: float, plate: float, beyond: FloatArray) -> float:
+    """Return the plate's level in the light where it is clipped.
+
+    Shade leaves the same share of ink and of plate, and what it leaves of ink is seen. `beyond`
+    (s, 2) are the levels of ink and plate there.
+    """
+    left = np.clip(beyond[:, 0] / ink, 1.0 / _MOST_BURNT, 1.0)
+    return float(np.clip(np.max(beyond[:, 1] / left), plate, _MOST_BURNT * plate))
 
 
 def _fitted(problem: FitProblem, poses: TwoPoses, starts: list[Parameters]) -> TwoPoses:

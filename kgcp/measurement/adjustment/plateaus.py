@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.image_model.light_field import LightField
 from kgcp.measurement.image_model.photometry import Light, decoded
+from kgcp.measurement.image_model.seen_shadows import FlatPixels, SeenShadows, find_shadows
 from kgcp.measurement.image_model.unblurred import UnblurredPlate, unblurred_plate
 
 # Tuning, by the flights `light` of `benchmarks.accuracy.evaluate`; lengths in radii, light in
@@ -27,12 +27,8 @@ _UNEVEN = 0.12  # smoothed levels vary so much: one pair of them would mislead
 _GLARE, _DARKEST_PLATE, _DARKER_INK = 0.06, 0.35, 0.5
 _GLARE_REACH, _SEEN = 1.5, 1e-3
 _LEAST_CONTRAST = 0.1
-_FEWEST_PIXELS = 12  # on either side of a step
-_MOST_PIXELS = 4000
-_TURNS, _OFFSETS, _REACH = 36, 61, 1.1  # of steps that are tried
-_STEP_GAIN = 0.5  # of the variance, that a step must explain
-_FIRST_WIDTH = 0.06
-_LEAST_BY_INK, _MOST_BY_INK = -0.1, 0.6  # change of ink by that of plate: shade takes, glare adds
+_FEWEST_PIXELS = 24  # of ink and of plate
+_MOST_PIXELS = 4000  # that tell where edges of shadows lie
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +53,7 @@ def look_at_plateaus(problem: FitProblem, pose: Pose, sd_px: float) -> Plateaus 
     unblurred = unblurred_plate(problem.circles, problem.measured_count, pose, window.rays)
     clear = _clear_of_edges(problem, unblurred, sd_px)
     ink, plate = (np.flatnonzero(kind) for kind in _kinds(problem, unblurred, clear))
-    if min(len(ink), len(plate)) < 2 * _FEWEST_PIXELS:
+    if min(len(ink), len(plate)) < _FEWEST_PIXELS:
         return None
     levels = np.array([_smoothed_over(problem, flat) for flat in (ink, plate)])
     black, white = (float(np.median(window.smooth[flat])) for flat in (ink, plate))
@@ -175,88 +171,15 @@ def field_of(
     return replace(field, values=values, offsets=offsets)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ShadowStep:
-    """A straight edge of a shadow, with the grey values of ink and plate on either side."""
-
-    angle: float  # of its normal, towards the shade [rad]
-    offset_px: float  # along that, from the target's centre
-    width_px: float  # σ of its penumbra
-    lit: FloatArray  # (2,)
-    shaded: FloatArray  # (2,)
-
-
-def step_across(problem: FitProblem, plateaus: Plateaus) -> ShadowStep | None:
-    """Return the straight edge that explains most of how the levels vary; None if that is little.
-
-    Levels of either side are means: it may have any share of the plate.
-    """
-    window = problem.window
+def shadows_across(problem: FitProblem, plateaus: Plateaus) -> list[SeenShadows]:
+    """Return straight edges of shadows that explain how the levels vary, the fewest first."""
     step = max(1, sum(map(len, plateaus.flat)) // _MOST_PIXELS)
     chosen = [flat[::step] for flat in plateaus.flat]
-    offsets = [window.pixels(flat) - problem.centre_px[:, None] for flat in chosen]
-    values = [window.smooth[flat] for flat in chosen]
-    noise = [max(float(np.median(np.abs(np.diff(v)))) ** 2, 1e-8) for v in values]
-    whole = sum(float(np.var(v)) * len(v) / n for v, n in zip(values, noise, strict=True))
-    radius_px = _REACH * problem.outer_radius_px
-    bins = np.linspace(-radius_px, radius_px, _OFFSETS)
-    best, edge = 0.0, None
-    for angle in math.pi * np.arange(_TURNS) / _TURNS:
-        gain, sides = np.zeros(_OFFSETS - 2), np.empty((2, 2, _OFFSETS - 2))
-        for k in (0, 1):
-            sums = np.zeros((2, len(bins) - 1))
-            _sum_across(offsets[k], values[k], math.cos(angle), math.sin(angle), radius_px, sums)
-            sides[:, k], explained = _steps(*sums)
-            gain += explained / noise[k]
-        place = int(gain.argmax())
-        if gain[place] > best:
-            best = float(gain[place])
-            edge = float(angle), float(bins[place + 1]), *sides[:, :, place]
-    if edge is None or best < _STEP_GAIN * whole:
-        return None
-    angle, offset_px, before, beyond = edge
-    by_ink, by_plate = (beyond - before).tolist()
-    if not by_plate or not _LEAST_BY_INK < by_ink / by_plate < _MOST_BY_INK:
-        return None
-    width_px = max(1.0, _FIRST_WIDTH * radius_px)
-    if by_plate > 0.0:  # the shade lies the other way
-        return ShadowStep(angle + math.pi, -offset_px, width_px, lit=beyond, shaded=before)
-    return ShadowStep(angle, offset_px, width_px, lit=before, shaded=beyond)
-
-
-@compiled
-def _sum_across(
-    offsets: FloatArray,
-    values: FloatArray,
-    cosine: float,
-    sine: float,
-    reach: float,
-    sums: FloatArray,
-) -> None:
-    """Count places (2, n), and sum up their values, in bins from −reach to reach along a direction.
-
-    `sums` (2, bins) receives numbers and sums.
-    """
-    count = sums.shape[1]
-    per_bin = 0.5 * count / reach
-    for i in range(len(values)):
-        along = cosine * offsets[0, i] + sine * offsets[1, i]
-        k = int(np.floor((along + reach) * per_bin))
-        if 0 <= k < count:
-            sums[0, k] += 1.0
-            sums[1, k] += values[i]
-
-
-def _steps(count: FloatArray, total: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the means (2, b - 1) before and beyond every inner border, and what steps explain.
-
-    Of each bin (b,), the number of values and their sum are given. Where a side has few values,
-    both means are that of all.
-    """
-    below, sum_below = np.cumsum(count)[:-1], np.cumsum(total)[:-1]
-    above, sum_above = count.sum() - below, total.sum() - sum_below
-    usable = np.minimum(below, above) >= _FEWEST_PIXELS
-    sides = np.stack((sum_below / np.maximum(below, 1), sum_above / np.maximum(above, 1)))
-    sides[:, ~usable] = total.sum() / max(count.sum(), 1)
-    explained = (sides[1] - sides[0]) ** 2 * below * above / max(count.sum(), 1)
-    return sides, np.asarray(explained)
+    index = np.concatenate(chosen)
+    flat = FlatPixels(
+        offsets=problem.window.pixels(index) - problem.centre_px[:, None],
+        kind=np.repeat((0, 1), [len(each) for each in chosen]),
+        levels=problem.window.smooth[index],
+        high=problem.censoring.high,
+    )
+    return find_shadows(flat, problem.tone)

@@ -40,8 +40,6 @@ from kgcp.measurement.adjustment.solver import (
     noise_of,
 )
 from kgcp.measurement.image_model.light_field import (
-    EDGE_MEAN,
-    EDGE_PRECISION,
     LEVEL_OFFSET_PRECISION,
     SPAN,
     LightField,
@@ -56,6 +54,7 @@ from kgcp.measurement.image_model.photometry import (
     plateau_levels,
     toned,
 )
+from kgcp.measurement.image_model.shadow_edges import NO_EDGES
 
 # Tuning of the levels, by the light flights of `benchmarks.accuracy.evaluate`. Fits that are
 # continued from their end, by three phases more, move by 0.05 σ of the distance or less (RMS; in
@@ -111,7 +110,7 @@ def even_field(problem: FitProblem) -> LightField:
         values=np.zeros((2, count)),
         precision=np.full((2, count), _FIRST_SD**-2),
         offsets=np.zeros(2),
-        edges=np.empty((0, 5)),
+        shadows=NO_EDGES,
         centre_px=problem.centre_px,
     )
 
@@ -226,6 +225,7 @@ def _evened(problem: FitProblem, parameters: Parameters) -> FitProblem:
     light = parameters.light
     black, white = plateau_levels(light, problem.tone)
     ink, plate = (encoded(toned(x, light.values), problem.tone) for x in (added[0], 1.0 + added[1]))
+    white, plate = min(white, 1.0), np.minimum(plate, 1.0)  # burnt white is seen clipped
     contrast = np.maximum(plate - ink, _LEAST_CONTRAST * (white - black))
     smooth = black + (window.smooth - ink) * (white - black) / contrast
     return replace(problem, window=replace(window, smooth=smooth))
@@ -323,9 +323,9 @@ def _equations(
     by_level = jacobian[PARAM_COUNT:] / sd
     scaled = np.vstack((scaled_rows(jacobian, unknowns.free, sd), by_level))
     precision = np.append(unknowns.free_precision, (LEVEL_OFFSET_PRECISION,) * 2)
-    if len(field.edges):
+    if len(field.shadows.rows):
         scaled = np.vstack((scaled, field.edge_rows(sample.pixels, by_level)))
-        precision = np.append(precision, np.tile(EDGE_PRECISION, len(field.edges)))
+        precision = np.append(precision, field.shadows.precision)
     normal = normal_matrix(scaled, current, replace(unknowns, free_precision=precision))
     return eliminate_levels(scaled, normal, at_knots, by_level, current, field.precision)
 
@@ -345,8 +345,8 @@ class _WithLevels:
         free = unknowns.free
         of_levels = reduced.gradient_of_levels(current.score, field.values)
         pull = unknowns.precision[free] * (unknowns.mean[free] - parameters.vector[free])
-        pull_of_edges = (EDGE_PRECISION * (EDGE_MEAN - field.edges)).ravel()
-        pulls = np.concatenate((pull, -LEVEL_OFFSET_PRECISION * field.offsets, pull_of_edges))
+        of_offsets = -LEVEL_OFFSET_PRECISION * field.offsets
+        pulls = np.concatenate((pull, of_offsets, field.shadows.pull))
         gradient = reduced.scaled @ current.score + pulls
         alone = reduced.half_solved(of_levels)
         gradient -= reduced.half_mixed.T @ alone

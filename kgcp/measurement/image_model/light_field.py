@@ -12,16 +12,17 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.special import ndtr
 
 from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.measurement.image_model.shadow_edges import INK, ShadowEdges
 
 LightAfterStep = Callable[[FloatArray, FloatArray], FloatArray]
 """Where light (2, n), of ink 0 and of plate 1 where it is even, is after a step (2, n)."""
 SPAN = 3  # knots in reach of a point, along either axis: quadratic splines
 _EVEN = np.array(((0.0,), (1.0,)))  # light of ink and of plate where it is even
-ANGLE, OFFSET, LOG_WIDTH, INK, PLATE = range(5)  # of a shadow's edge
+LEVEL_OFFSET_PRECISION = 4.0
+"""Of the offsets' prior: as weak as that of what edges of shadows add."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,10 +174,7 @@ class LightField:
     values: FloatArray  # (2, k): of ink and plate at all knots
     precision: FloatArray  # (2, k): of the values' prior, about 0
     offsets: FloatArray  # (2,): added to the levels of ink and plate everywhere
-    # (s, 5): straight edges of shadows: direction of its normal [rad], offset along that from the
-    # centre [px], logarithm of the penumbra's σ [px], and what is added beyond to the levels of ink
-    # and plate
-    edges: FloatArray
+    shadows: ShadowEdges  # about the centre
     centre_px: FloatArray  # (2,)
 
     @property
@@ -184,7 +182,7 @@ class LightField:
         """The priors' part of the negative log-likelihood."""
         of_offsets = 0.5 * LEVEL_OFFSET_PRECISION * float(self.offsets @ self.offsets)
         of_values = 0.5 * float(np.sum(self.precision * self.values**2))
-        return of_values + of_offsets + edge_penalty(self.edges)
+        return of_values + of_offsets + self.shadows.penalty
 
     def added(self, pixels: FloatArray) -> FloatArray:
         """Return what is added to the levels of ink and plate (2, n) at pixels (2, n)."""
@@ -196,31 +194,20 @@ class LightField:
         for grid in range(len(self.knots.spacings_px)):
             _add_values(self.knots, grid, self.values[:, self.knots.of_grid(grid)], pixels, seen)
         added, gradient = seen[:2] + self.offsets[:, None], seen[2:]
-        for edge in self.edges:
-            z = sigmas_beyond(edge, pixels - self.centre_px[:, None])
-            added += edge[INK:, None] * ndtr(z)
-            slope = (edge[PLATE] - edge[INK]) * math.exp(-edge[LOG_WIDTH]) * _density(z)
-            gradient[0] += math.cos(edge[ANGLE]) * slope
-            gradient[1] += math.sin(edge[ANGLE]) * slope
-        return added, gradient
+        by_shadows, gradient_of_shadows = self.shadows.added_with_gradient(
+            self._about_centre(pixels)
+        )
+        return added + by_shadows, gradient + gradient_of_shadows
 
     def edge_rows(self, pixels: FloatArray, by_level: FloatArray) -> FloatArray:
         """Return the derivatives (5 s, n) by the shadows' edges.
 
         `by_level` (2, n) are those by the levels of ink and plate.
         """
-        offsets = pixels - self.centre_px[:, None]
-        rows = np.empty((len(self.edges), 5, pixels.shape[1]))
-        for k, edge in enumerate(self.edges):
-            z = sigmas_beyond(edge, offsets)
-            across = -math.sin(edge[ANGLE]) * offsets[0] + math.cos(edge[ANGLE]) * offsets[1]
-            by_z = (edge[INK] * by_level[0] + edge[PLATE] * by_level[1]) * _density(z)
-            per_px = math.exp(-edge[LOG_WIDTH])
-            rows[k, ANGLE] = by_z * across * per_px
-            rows[k, OFFSET] = -by_z * per_px
-            rows[k, LOG_WIDTH] = -by_z * z
-            rows[k, INK:] = by_level * ndtr(z)
-        return rows.reshape(-1, pixels.shape[1])
+        return self.shadows.derivatives(self._about_centre(pixels), by_level)
+
+    def _about_centre(self, pixels: FloatArray) -> FloatArray:
+        return pixels - self.centre_px[:, None]
 
     def moved(
         self,
@@ -241,8 +228,8 @@ class LightField:
 
         nothing = np.zeros((2, 1))
         of_offsets = correction(nothing, step)
-        edges, values = self.edges + edges, self.values + values
-        for old, new in zip(self.edges, edges, strict=True):
+        edges, values = self.shadows.rows + edges, self.values + values
+        for old, new in zip(self.shadows.rows, edges, strict=True):
             amplitude, change = old[INK:, None], (new - old)[INK:, None]
             new[INK:] += (correction(amplitude, step + change) - of_offsets)[:, 0]
         added, taken = nothing, of_offsets
@@ -257,7 +244,9 @@ class LightField:
                 step = step + _of_grid(self.knots, grid, own_step, places)
                 taken = taken + _of_grid(self.knots, grid, change, places)
         offsets = self.offsets + offsets + of_offsets[:, 0]
-        return replace(self, values=values, offsets=offsets, edges=edges)
+        return replace(
+            self, values=values, offsets=offsets, shadows=replace(self.shadows, rows=edges)
+        )
 
 
 @lru_cache(maxsize=4)
@@ -284,26 +273,3 @@ def _of_grid(knots: Knots, grid: int, values: FloatArray, pixels: FloatArray) ->
     seen = np.zeros((4, pixels.shape[1]))
     _add_values(knots, grid, values, pixels, seen)
     return seen[:2]
-
-
-def sigmas_beyond(edge: FloatArray, offsets: FloatArray) -> FloatArray:
-    """Return how far places (2, n) [px] are beyond a shadow's edge, in penumbra's σ."""
-    along = np.cos(edge[ANGLE]) * offsets[0] + np.sin(edge[ANGLE]) * offsets[1]
-    return np.asarray((along - edge[OFFSET]) / np.exp(edge[LOG_WIDTH]))
-
-
-def _density(z: FloatArray) -> FloatArray:
-    """Return the standard normal density."""
-    return np.asarray(np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi))
-
-
-# Weak priors of a shadow's edge, ANGLE to PLATE: a penumbra of σ = 2 px within a factor of e, and
-# steps of half the contrast. Direction and offset have none.
-EDGE_MEAN = np.array((0.0, 0.0, 0.7, 0.0, 0.0))
-EDGE_PRECISION = np.array((0.0, 0.0, 1.0, 4.0, 4.0))
-LEVEL_OFFSET_PRECISION = 4.0  # of offsets, as weak as that of steps
-
-
-def edge_penalty(edges: FloatArray) -> float:
-    """Return the priors' part of shadows' edges."""
-    return float(0.5 * np.sum(EDGE_PRECISION * (edges - EDGE_MEAN) ** 2))

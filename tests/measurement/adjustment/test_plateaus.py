@@ -12,7 +12,7 @@ import pytest
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.adjustment.plateaus import Plateaus, look_at_plateaus, step_across
+from kgcp.measurement.adjustment.plateaus import Plateaus, look_at_plateaus, shadows_across
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.targets.layout import Target
 
@@ -51,7 +51,7 @@ def test_even_light_is_even(
     problem, plateaus = look(target)
     assert not plateaus.is_uneven
     assert plateaus.typical == pytest.approx((0.08, 0.75), abs=0.006)
-    assert step_across(problem, plateaus) is None
+    assert shadows_across(problem, plateaus) == []
 
 
 def test_where_no_ink_or_plate_is_seen_the_levels_are_those_of_what_is_farther_off(
@@ -76,13 +76,13 @@ def test_a_shadow_s_edge_is_found_where_it_lies(
     sign = round(math.cos(way - WAY))
     problem, plateaus = look(target, lambda along: np.where(sign * along > off_px, LEFT, 1.0))
     assert plateaus.is_uneven
-    step = step_across(problem, plateaus)
-    assert step is not None
-    turn = (step.angle - way + math.pi) % (2.0 * math.pi) - math.pi
-    assert turn == pytest.approx(0.0, abs=math.radians(8.0))
-    assert step.offset_px == pytest.approx(off_px, abs=4.0)
-    assert step.lit == pytest.approx((0.08, 0.75), abs=0.015)
-    assert step.shaded == pytest.approx((0.08 * LEFT, 0.75 * LEFT), abs=0.04)
+    (seen,) = shadows_across(problem, plateaus)
+    ((angle, offset_px, _, *step),) = seen.edges.rows.tolist()
+    turn = (angle - way + math.pi) % (2.0 * math.pi) - math.pi
+    assert turn == pytest.approx(0.0, abs=math.radians(2.0))
+    assert offset_px == pytest.approx(off_px, abs=1.0)
+    assert seen.lit == pytest.approx((0.08, 0.75), abs=0.01)
+    assert step == pytest.approx([-0.08 * (1.0 - LEFT), -0.75 * (1.0 - LEFT)], abs=0.01)
 
 
 def test_a_step_that_only_plate_shows_leaves_ink_as_it_is(
@@ -94,10 +94,9 @@ def test_a_step_that_only_plate_shows_leaves_ink_as_it_is(
         math.cos(WAY),
         math.sin(WAY),
     )
-    step = step_across(problem, replace(plateaus, flat=(ink[along < 52.0], plate)))
-    assert step is not None
-    assert [step.lit[0], step.shaded[0]] == pytest.approx([0.08, 0.08], abs=0.01)
-    assert step.lit[1] - step.shaded[1] == pytest.approx(0.75 * (1.0 - LEFT), rel=0.15)
+    (seen,) = shadows_across(problem, replace(plateaus, flat=(ink[along < 52.0], plate)))
+    assert seen.lit[0] == pytest.approx(0.08, abs=0.01)
+    assert seen.edges.rows[0, 3:] == pytest.approx([0.0, -0.75 * (1.0 - LEFT)], abs=0.04)
 
 
 @pytest.mark.parametrize(
@@ -124,7 +123,7 @@ def test_a_step_is_one_that_shade_or_glare_can_make(
     for flat, step in zip(plateaus.flat, (on_ink, on_plate), strict=True):
         smooth[flat[problem.window.pixels(flat)[0] > right]] += step
     stepped = replace(problem, window=replace(problem.window, smooth=smooth))
-    assert (step_across(stepped, plateaus) is not None) == is_light
+    assert bool(shadows_across(stepped, plateaus)) == is_light
 
 
 def test_ink_under_glare_is_ink(

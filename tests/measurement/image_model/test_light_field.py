@@ -1,4 +1,4 @@
-"""Levels that vary over a window: splines on grids of knots, straight edges of shadows."""
+"""Levels that vary over a window: splines on grids of knots, and what shadows add."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from scipy.interpolate import BSpline
 from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.image_model.light_field import LightField, knots_over
 from kgcp.measurement.image_model.photometry import Light, light_after_step
+from kgcp.measurement.image_model.shadow_edges import NO_EDGES, ShadowEdges
 
 _SPACING_PX = 8.0
 
@@ -25,7 +26,7 @@ def _field(
         np.zeros((2, count)),
         np.ones((2, count)),
         np.zeros(2),
-        np.empty((0, 5)),
+        NO_EDGES,
         np.array([132.0, 224.0]),
     )
 
@@ -63,18 +64,6 @@ def test_weights_are_those_of_quadratic_b_splines() -> None:
     assert np.abs(dense - expected).max() < 1e-12
 
 
-def test_derivatives_by_a_shadow_s_edge_are_those_of_differences() -> None:
-    edge, pixels = np.array([[0.4, 3.0, 0.9, -0.05, -0.4]]), _pixels()
-    field = replace(_field(), edges=edge)
-    by_level = np.random.default_rng(2).normal(size=(2, pixels.shape[1]))
-    rows, step = field.edge_rows(pixels, by_level), 1e-6
-    for k in range(5):
-        change = step * np.eye(5)[k]
-        more, less = (replace(field, edges=edge + sign * change) for sign in (1.0, -1.0))
-        slope = (more.added(pixels) - less.added(pixels)) / (2.0 * step)
-        assert np.abs(rows[k] - np.sum(by_level * slope, axis=0)).max() < 1e-7
-
-
 def test_offsets_add_to_the_levels_everywhere_and_have_a_weak_prior() -> None:
     field, pixels = _field(), _pixels()
     field = replace(field, values=np.random.default_rng(3).normal(size=field.values.shape))
@@ -99,14 +88,6 @@ def test_a_slope_of_the_knots_is_a_slope_of_the_field() -> None:
     assert np.abs(added[0] + added[1]).max() < 1e-12
 
 
-def test_a_shadow_is_half_as_deep_at_its_edge_and_whole_beyond() -> None:
-    edge = np.array([[0.0, 5.0, np.log(2.0), -0.03, -0.5]])
-    pixels = np.array([[137.0, 160.0, 110.0], [224.0, 230.0, 215.0]])
-    added = replace(_field(), edges=edge).added(pixels)
-    assert added[1] == pytest.approx([-0.25, -0.5, 0.0], abs=1e-6)
-    assert added[0] == pytest.approx([-0.015, -0.03, 0.0], abs=1e-6)
-
-
 def test_gradient_of_the_contrast_is_that_of_what_is_added() -> None:
     rng = np.random.default_rng(5)
     field = _field()
@@ -115,7 +96,7 @@ def test_gradient_of_the_contrast_is_that_of_what_is_added() -> None:
         field,
         knots=coarse,
         values=rng.normal(0.0, 0.2, (2, sum(coarse.counts))),
-        edges=np.array([[0.7, 3.0, 0.9, -0.05, -0.5]]),
+        shadows=ShadowEdges(np.array([[0.7, 3.0, 0.9, -0.05, -0.5]]), 1),
     )
     pixels = np.array([[100.0], [200.0]]) + rng.uniform(2.0, 40.0, (2, 50))
     step, by_steps = 1e-4, np.empty((2, 50))
@@ -136,7 +117,7 @@ def test_steps_follow_levels_of_another_scale_everywhere(
     field, pixels = _field(spacings_px=spacings_px), _pixels()
     shape = field.values.shape
     field = replace(field, values=0.1 * rng.normal(size=shape), offsets=np.array([0.1, -0.2]))
-    field = replace(field, edges=edge)
+    field = replace(field, shadows=ShadowEdges(edge, edges))
     before, after = Light(0.1, 0.7), Light(0.15, 0.9)
 
     def light_after(light: FloatArray, step: FloatArray) -> FloatArray:
@@ -147,7 +128,7 @@ def test_steps_follow_levels_of_another_scale_everywhere(
     change = np.zeros_like(edge)
     change[:, 3:] = 0.1
     step = replace(field, values=field.values + values, offsets=field.offsets + offsets)
-    step = replace(step, edges=edge + change)
+    step = replace(step, shadows=ShadowEdges(edge + change, edges))
     base = np.array([[0.0], [1.0]])
     light = base + field.added(pixels)
     expected = light_after(light, base + step.added(pixels) - light)

@@ -1,0 +1,99 @@
+"""Edges of shadows found in what is flat on a plate."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.measurement.image_model.photometry import Tone
+from kgcp.measurement.image_model.seen_shadows import FlatPixels, SeenShadows, find_shadows
+from kgcp.measurement.image_model.shadow_edges import ShadowEdges
+
+RADIUS_PX, NOISE, HIGH = 45.0, 0.004, 0.998
+EDGE = [0.9, 4.0, 0.8]
+STRIP = [[2.5, 8.0, 0.3], [2.5, 16.0, 0.3]]
+
+
+def flat_under(
+    shares: list[list[float]],
+    single: int,
+    ink: float = 0.08,
+    plate: float = 0.75,
+    left: float = 0.5,
+) -> FlatPixels:
+    """Ink within a ring, plate beside it; shades leave the same share of both."""
+    rng = np.random.default_rng(3)
+    y, x = np.mgrid[-RADIUS_PX:RADIUS_PX, -RADIUS_PX:RADIUS_PX] + 0.3
+    offsets = np.stack((x[np.hypot(x, y) < RADIUS_PX], y[np.hypot(x, y) < RADIUS_PX]))
+    kind = (np.hypot(*offsets) < 0.5 * RADIUS_PX).astype(np.intp)
+    light = _light(shares, single, offsets, left)
+    levels = np.where(kind, plate, ink) * light + NOISE * rng.standard_normal(len(kind))
+    return FlatPixels(offsets, kind, np.clip(levels, 0.0, 1.0), HIGH)
+
+
+def _light(lines: list[list[float]], single: int, offsets: FloatArray, left: float) -> FloatArray:
+    if not lines:
+        return np.ones(offsets.shape[1])
+    signs = [1.0 if k <= single or (k - single) % 2 == 0 else -1.0 for k in range(len(lines))]
+    rows = [[*line, 0.0, -sign * (1.0 - left)] for line, sign in zip(lines, signs, strict=True)]
+    added, _ = ShadowEdges(np.array(rows), single).added_with_gradient(offsets)
+    return np.asarray(1.0 + added[1])
+
+
+def lines_of(seen: SeenShadows) -> FloatArray:
+    lines = seen.edges.rows[:, :2].copy()
+    lines[:, 0] %= 2.0 * math.pi
+    return lines
+
+
+def test_even_light_has_no_shadows() -> None:
+    assert find_shadows(flat_under([], 0), Tone.LINEAR) == []
+
+
+def test_one_edge_is_a_shade_of_its_own() -> None:
+    (seen,) = find_shadows(flat_under([EDGE], 1), Tone.LINEAR)
+    assert seen.edges.single == 1
+    assert lines_of(seen)[0] == pytest.approx(EDGE[:2], abs=0.2)
+    assert seen.lit == pytest.approx([0.08, 0.75], abs=0.002)
+    assert seen.edges.rows[0, 3:] == pytest.approx([-0.04, -0.375], abs=0.003)
+    assert not seen.is_burnt(HIGH)
+
+
+def test_a_strip_has_two_edges_and_hides_nothing() -> None:
+    seen = find_shadows(flat_under(STRIP, 0), Tone.LINEAR)[0]
+    assert seen.edges.single == 0
+    assert lines_of(seen) == pytest.approx(np.array(STRIP)[:, :2], abs=0.2)
+    assert seen.edges.rows[:, 4] == pytest.approx([-0.375, 0.375], abs=0.02)
+
+
+def test_a_strip_is_told_from_the_shade_that_it_runs_into() -> None:
+    """The edge comes first, although the strip adds to what it explains."""
+    first, both = find_shadows(flat_under([EDGE, *STRIP], 1), Tone.LINEAR)
+    assert (first.edges.single, len(first.edges.rows)) == (1, 1)
+    assert (both.edges.single, len(both.edges.rows)) == (1, 3)
+    assert lines_of(both) == pytest.approx(np.array([EDGE, *STRIP])[:, :2], abs=0.2)
+    assert both.edges.rows[:, 4] == pytest.approx([-0.375, -0.375, 0.375], abs=0.02)
+
+
+def test_where_white_is_burnt_on_either_side_ink_shows_the_shadow() -> None:
+    flat = flat_under([EDGE], 1, ink=0.12, plate=1.9, left=0.6)
+    assert flat.levels[flat.kind == 1].min() == 1.0
+    (seen,) = find_shadows(flat, Tone.LINEAR)
+    assert seen.is_burnt(HIGH)
+    assert lines_of(seen)[0] == pytest.approx(EDGE[:2], abs=0.6)
+    assert seen.edges.rows[0, 3] == pytest.approx(-0.048, abs=0.003)
+
+
+def test_a_highlight_beside_which_white_is_burnt_too_is_no_shade() -> None:
+    """It adds to ink what it adds to white, which is not seen."""
+    flat = flat_under([EDGE], 1, ink=0.5, plate=1.9, left=0.4)
+    assert find_shadows(flat, Tone.LINEAR) == []
+
+
+def test_what_ink_alone_shows_is_no_light() -> None:
+    flat = flat_under([], 0)
+    levels = flat.levels + 0.2 * ((flat.kind == 0) & (flat.offsets[0] > 5.0))
+    assert find_shadows(FlatPixels(flat.offsets, flat.kind, levels, HIGH), Tone.LINEAR) == []
