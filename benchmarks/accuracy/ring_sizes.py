@@ -58,6 +58,15 @@ _LIGHTS: dict[str, dict[str, object]] = {
     "burnt": {"gain": (1.15, 2.2)},
     "half in shade": {"shadow": Shadow(light_left=0.5, edges=1, stripes=0)},
     "antenna's shadow": {"shadow": Shadow(light_left=0.6, edges=0, stripes=1)},
+    "both shadows": {"shadow": Shadow(light_left=0.5, edges=1, stripes=1)},
+    "burnt, half in shade": {
+        "gain": (1.15, 2.2),
+        "shadow": Shadow(light_left=0.5, edges=1, stripes=0),
+    },
+    "burnt, antenna's": {
+        "gain": (1.15, 2.2),
+        "shadow": Shadow(light_left=0.6, edges=0, stripes=1),
+    },
     "dirt": {"dirt": Dirt()},
     "highlights": {"glare": Glare()},
 }

@@ -15,7 +15,7 @@ from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.fit_target import measure_by_model
 from kgcp.measurement.adjustment.pixels import Sample, select_pixels
-from kgcp.measurement.records import InitialPose
+from kgcp.measurement.records import InitialPose, Measurement
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Sensor, ToneCurve
 from kgcp.simulation.light_field import PlateLight, Shade
@@ -69,13 +69,51 @@ def test_white_burnt_in_the_light_hides_nothing(
         return sample
 
     monkeypatch.setattr("kgcp.measurement.adjustment.random_levels.select_pixels", select)
-    camera, rng = replace(LENS, response=Response.LINEAR), np.random.default_rng(7)
-    ray = np.append(camera.undistort(np.array([208.0, 170.0])), 1.0)
-    pose = Pose(np.eye(3), ray * 0.45 * camera.mean_focal_px / 46.0)
-    half = PlateLight(light_left=0.5, shades=(Shade((1.0, 0.0), 50.0, 100.0, 0.05),))
-    grey = photograph(camera, pose, rng, gain=1.8, field=half)
-    start = start_near(camera, pose, rng)
-    seen = measure_by_model(grey, camera, TARGET_PLATE.target, start)
+    pose, seen = half_in_shade(photograph, start_near, Response.LINEAR, ToneCurve.LINEAR, 0.0)
     assert seen.distance_m == pytest.approx(pose.distance_m, rel=2e-4)
     assert shares == pytest.approx([0.5] * len(shares), abs=0.05)
     assert len(shares) >= 1
+
+
+@pytest.mark.parametrize(
+    ("response", "tone"),
+    [
+        (Response.LINEAR, ToneCurve.LINEAR),
+        (Response.SRGB, ToneCurve.SRGB),
+        (Response.UNKNOWN, ToneCurve.SRGB),
+    ],
+)
+def test_displaced_edges_are_those_of_the_light_that_falls_on_them(
+    photograph: Callable[..., GreyArray],
+    start_near: Callable[..., InitialPose],
+    response: Response,
+    tone: ToneCurve,
+) -> None:
+    """By the white that is seen, 1, none of them would seem displaced."""
+    shifts_px = []
+    for edge_m in (0.7, 0.44, 0.0):  # none in shade, hardly any, half of them
+        _, seen = half_in_shade(photograph, start_near, response, tone, edge_m)
+        shifts_px.append(seen.appearance.edge_shift_px)
+    even, hardly, half = shifts_px
+    assert even is not None
+    assert even > 0.3
+    assert hardly == pytest.approx(even, abs=0.03)
+    assert half is not None
+    assert 0.35 * even < half < 0.85 * even
+
+
+def half_in_shade(
+    photograph: Callable[..., GreyArray],
+    start_near: Callable[..., InitialPose],
+    response: Response,
+    tone: ToneCurve,
+    edge_m: float,
+) -> tuple[Pose, Measurement]:
+    """Measure a plate that is burnt where the light falls on it: left of an edge."""
+    camera, rng = replace(LENS, response=response), np.random.default_rng(7)
+    ray = np.append(camera.undistort(np.array([208.0, 170.0])), 1.0)
+    pose = Pose(np.eye(3), ray * 0.45 * camera.mean_focal_px / 46.0)
+    field = PlateLight(light_left=0.5, shades=(Shade((1.0, 0.0), 50.0 + edge_m, 100.0, 0.05),))
+    grey = photograph(camera, pose, rng, sensor=Sensor(tone=tone), gain=1.8, field=field)
+    start = start_near(camera, pose, rng)
+    return pose, measure_by_model(grey, camera, TARGET_PLATE.target, start)

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from scipy.special import ndtri
 
+from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.measurement.adjustment.solver import TargetFit, noise_of
 from kgcp.measurement.image_model.blur import variance_in_pixels
-from kgcp.measurement.image_model.photometry import Tone, plateau_levels, share_at
+from kgcp.measurement.image_model.photometry import (
+    Tone,
+    encoded,
+    plateau_levels,
+    share_at,
+    toned,
+)
 from kgcp.measurement.image_model.window import contour_px, semi_major_axis_px
 from kgcp.measurement.records import Appearance, Imaging, ToneBase
 from kgcp.targets.layout import Target
@@ -18,6 +26,9 @@ from kgcp.targets.layout import Target
 TONE_OF_BASE = {ToneBase.SRGB: Tone.UNKNOWN, ToneBase.LINE: Tone.UNKNOWN_FROM_LINE}
 """The tone of a fit, by the base that it departs from."""
 _BASE_OF_TONE = {tone: base for base, tone in TONE_OF_BASE.items()}
+_NEAR_EDGE = 0.3  # of the white share, from a half
+_LEAST_SHARE = 1e-3
+_LIGHTS = 400  # of which the grey value is computed
 
 
 def appearance_of(camera: Camera, target: Target, fit: TargetFit) -> Appearance:
@@ -43,15 +54,40 @@ def appearance_of(camera: Camera, target: Target, fit: TargetFit) -> Appearance:
 
 
 def _edge_shift_px(fit: TargetFit) -> float:
-    """Return how far a straight edge seems displaced towards the dark side.
+    """Return how far a straight edge seems displaced towards the dark side, in the mean.
 
     The apparent edge is where the grey value passes midway between the plateaus as they are seen,
     clipped; the true one is where half the light comes from either side.
     """
-    light, problem = fit.parameters.light, fit.sample.problem
-    black, white = plateau_levels(light, problem.tone)
-    crossing = share_at(0.5 * (black + min(white, problem.censoring.high)), light, problem.tone)
-    return float(-fit.parameters.blur.mean_sd_px * ndtri(min(max(crossing, 1e-3), 1.0 - 1e-3)))
+    high = fit.sample.problem.censoring.high
+
+    def midway(ink: FloatArray, plate: FloatArray) -> FloatArray:
+        return np.asarray(0.5 * (ink + np.minimum(plate, high)))
+
+    return -float(np.mean(places_across_edges_px(fit, midway)))
+
+
+def places_across_edges_px(
+    fit: TargetFit, level_between: Callable[[FloatArray, FloatArray], FloatArray]
+) -> FloatArray:
+    """Return how far from a straight edge, towards white, grey values are reached (n,) [px].
+
+    `level_between` gives them by those of ink and plate beside the edge (n,), not clipped. In even
+    light there is one; otherwise there is one for every pixel near an edge.
+    """
+    light, tone, field = fit.parameters.light, fit.sample.problem.tone, fit.parameters.field
+    if field is None:
+        ink, plate = (np.array([level]) for level in plateau_levels(light, tone))
+        shares = np.array([share_at(float(level_between(ink, plate)[0]), light, tone)])
+    else:
+        near = np.abs(fit.prediction.share - 0.5) < _NEAR_EDGE
+        ink, plate = np.array([[0.0], [1.0]]) + field.added(fit.sample.pixels[:, near])
+        levels = level_between(*(encoded(toned(x, light.values), tone) for x in (ink, plate)))
+        lights = np.linspace(float(ink.min()), float(plate.max()), _LIGHTS)
+        rising = np.maximum.accumulate(encoded(toned(lights, light.values), tone))
+        shares = (np.interp(levels, rising, lights) - ink) / (plate - ink)
+    shares = np.clip(shares, _LEAST_SHARE, 1.0 - _LEAST_SHARE)
+    return np.asarray(fit.parameters.blur.mean_sd_px * ndtri(shares))
 
 
 def imaging_of(fit: TargetFit) -> Imaging | None:

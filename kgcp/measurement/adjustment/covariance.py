@@ -15,13 +15,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import expit, ndtri
+from scipy.special import expit
 
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.appearance import places_across_edges_px
 from kgcp.measurement.adjustment.normal_equations import normal_matrix
 from kgcp.measurement.adjustment.solver import TargetFit, noise_of
 from kgcp.measurement.adjustment.spread_shape import (
@@ -36,7 +37,6 @@ from kgcp.measurement.image_model.photometry import (
     Param,
     Tone,
     plateau_levels,
-    share_at,
 )
 from kgcp.measurement.image_model.rolling_shutter import RollingShutter
 from kgcp.measurement.image_model.rotation_displacement import mean_square_displacement
@@ -249,12 +249,11 @@ def _halo_displacement_px(light: Light) -> float:
 
 
 def _clipped_reach_px(fit: TargetFit) -> float:
-    """Return how far the middle of a straight edge is within what is clipped [px]."""
-    light, problem = fit.parameters.light, fit.sample.problem
-    burnt = share_at(problem.censoring.high, light, problem.tone)
-    sunk = share_at(problem.censoring.low, light, problem.tone)
-    hidden = max(0.5 - burnt, sunk - 0.5, 0.0)
-    return float(fit.parameters.blur.mean_sd_px * ndtri(min(0.5 + hidden, 1.0 - 1e-3)))
+    """Return how far the middle of a straight edge is within what is clipped, in the mean [px]."""
+    limits = fit.sample.problem.censoring
+    burnt = places_across_edges_px(fit, lambda *beside: np.full(len(beside[0]), limits.high))
+    sunk = places_across_edges_px(fit, lambda *beside: np.full(len(beside[0]), limits.low))
+    return float(np.mean(np.maximum(0.0, np.maximum(-burnt, sunk))))
 
 
 def _edge_pull(fit: TargetFit, scaled: FloatArray, circle: IndexArray) -> FloatArray:

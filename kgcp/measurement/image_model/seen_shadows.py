@@ -37,6 +37,7 @@ _LEAST_NOISE = 0.01
 _FIRST_WIDTH, _WIDTH_IN_STRIP = 0.06, 0.3
 _LEAST_LOG_WIDTH, _MOST_LOG_WIDTH = -1.0, 6.0
 _STEPS, _TRIALS, _FIRST_DAMPING, _SETTLED = 12, 4, 1e-3, 1e-3
+_ALMOST_NOTHING = 1e-6  # of full scale
 # Change of ink by that of plate: shade takes from both what they have, a highlight adds to both.
 _LEAST_BY_INK, _MOST_BY_INK = -0.2, 0.6
 _BURNT = 0.02  # of the contrast: so near to the limit, white may be anything above
@@ -70,7 +71,7 @@ def find_shadows(flat: FlatPixels, tone: Tone) -> list[SeenShadows]:
     """Return straight edges that explain most of how grey values vary, the fewest first.
 
     Each adds a step or a strip to the one before; there is none if nothing explains most. There are
-    pixels of both kinds, and ink is darker than plate.
+    pixels of both kinds.
     """
     means = np.array([flat.levels[flat.kind == kind].mean() for kind in (0, 1)])
     sd = _noise_of(flat, float(means[1] - means[0]))
@@ -93,7 +94,7 @@ def find_shadows(flat: FlatPixels, tone: Tone) -> list[SeenShadows]:
 def _noise_of(flat: FlatPixels, contrast: float) -> FloatArray:
     """Return the standard deviation of grey values of ink and plate (2,)."""
     differences = (np.abs(np.diff(flat.levels[flat.kind == kind])) for kind in (0, 1))
-    least = _LEAST_NOISE * contrast
+    least = max(_LEAST_NOISE * contrast, _ALMOST_NOTHING)
     return np.array([max(float(np.median(each)), least) for each in differences])
 
 
@@ -110,7 +111,7 @@ def _may_be_shade(seen: SeenShadows, high: float, tone: Tone) -> bool:
     Where white is burnt, shade need not show on it but on ink, which is dark without a highlight.
     """
     by_ink, by_plate = seen.edges.rows[:, INK], seen.edges.rows[:, PLATE]
-    ratios = by_ink / np.where(by_plate == 0.0, np.finfo(float).tiny, by_plate)
+    ratios = by_ink / np.where(by_plate == 0.0, _ALMOST_NOTHING, by_plate)
     if np.all((ratios > _LEAST_BY_INK) & (ratios < _MOST_BY_INK)):
         return True
     ink, plate = decoded(seen.lit, Tone.SRGB if tone.is_unknown else tone).tolist()
@@ -166,7 +167,11 @@ def _with_best_step(
     Shades with one edge come first, and darken.
     """
     reach_px = float(np.hypot(*flat.offsets).max())
-    gain, angle, first, last, *in_noise = _best_step(flat.offsets, rest, flat.kind, reach_px)
+    in_sun = seen.edges.sunlit(flat.offsets) > 0.5  # elsewhere, another shade takes nothing
+    offsets = np.ascontiguousarray(flat.offsets[:, in_sun])
+    gain, angle, first, last, *in_noise = _best_step(
+        offsets, rest[in_sun], flat.kind[in_sun], reach_px
+    )
     if gain == 0.0:
         return None
     borders_px, step = np.linspace(-reach_px, reach_px, _BORDERS), np.array(in_noise) * sd

@@ -83,6 +83,13 @@ class ShadowEdges:
             derivatives[k, INK:] = by_level * (beyond[k] * lit[k])
         return derivatives.reshape(-1, offsets.shape[1])
 
+    def sunlit(self, offsets: FloatArray) -> FloatArray:
+        """Return the share of the sun (n,) that shades with one edge leave at places (2, n)."""
+        if not self.single:
+            return np.ones(offsets.shape[1])
+        _, beyond, _ = self._seen_from(offsets)
+        return np.asarray(np.prod(1.0 - beyond[: self.single], axis=0))
+
     def _seen_from(self, offsets: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return how far places are beyond each edge, in σ of its penumbra and as Φ of that.
 

@@ -7,9 +7,18 @@ import math
 import numpy as np
 import pytest
 
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.measurement.image_model.photometry import Tone
-from kgcp.measurement.image_model.seen_shadows import FlatPixels, SeenShadows, find_shadows
+from kgcp.measurement.image_model.seen_shadows import (
+    _BORDERS,
+    _BY_STRIP,
+    _DIRECTIONS,
+    _FEWEST_PIXELS,
+    FlatPixels,
+    SeenShadows,
+    _best_step,
+    find_shadows,
+)
 from kgcp.measurement.image_model.shadow_edges import ShadowEdges
 
 RADIUS_PX, NOISE, HIGH = 45.0, 0.004, 0.998
@@ -97,3 +106,48 @@ def test_what_ink_alone_shows_is_no_light() -> None:
     flat = flat_under([], 0)
     levels = flat.levels + 0.2 * ((flat.kind == 0) & (flat.offsets[0] > 5.0))
     assert find_shadows(FlatPixels(flat.offsets, flat.kind, levels, HIGH), Tone.LINEAR) == []
+
+
+def test_the_step_that_is_found_explains_most_of_all() -> None:
+    """Against sums over every pair of borders, by masks."""
+    rng = np.random.default_rng(8)
+    offsets, kind = rng.uniform(-RADIUS_PX, RADIUS_PX, (2, 300)), rng.integers(0, 2, 300)
+    values = rng.standard_normal(300) + 0.8 * (offsets[0] > 7.0)
+    reach_px = float(np.hypot(*offsets).max())
+    gain, angle, first, last, ink, plate = _best_step(offsets, values, kind, reach_px)
+    most, found, number = 0.0, (0.0, 0, 0), _BORDERS - 1
+    for way in math.pi * np.arange(_DIRECTIONS) / _DIRECTIONS:
+        along_px = math.cos(way) * offsets[0] + math.sin(way) * offsets[1]
+        before = np.minimum((0.5 * number * (along_px / reach_px + 1.0)).astype(int), number - 1)
+        for near in range(1, number):
+            within = before[:, None] < np.arange(near + 1, number + 1)
+            within &= (before >= near)[:, None]
+            by_kind = [_explained(values[kind == k], within[kind == k]) for k in (0, 1)]
+            explained = by_kind[0] + by_kind[1]
+            explained[:-1] *= _BY_STRIP
+            if explained.max() > most:
+                most, found = (
+                    float(explained.max()),
+                    (way, near, near + 1 + int(explained.argmax())),
+                )
+    assert gain == pytest.approx(most)
+    assert (angle, first, last) == pytest.approx(found)
+    for k, step in enumerate((ink, plate)):
+        own, place = (
+            values[kind == k],
+            (offsets[:, kind == k].T @ (math.cos(angle), math.sin(angle))),
+        )
+        border_px = np.linspace(-reach_px, reach_px, _BORDERS)[first]
+        is_beyond = place >= border_px
+        assert last == number
+        assert step == pytest.approx(own[is_beyond].mean() - own[~is_beyond].mean())
+
+
+def _explained(values: FloatArray, within: BoolArray) -> FloatArray:
+    """Of squares, by steps (b,) that hold some of the values, given as columns (n, b)."""
+    count = within.sum(axis=0)
+    enough = np.minimum(count, len(values) - count) >= _FEWEST_PIXELS
+    inside = values @ within / np.maximum(count, 1)
+    outside = values @ ~within / np.maximum(len(values) - count, 1)
+    left = np.sum((values[:, None] - np.where(within, inside, outside)) ** 2, axis=0)
+    return np.where(enough, np.sum((values - values.mean()) ** 2) - left, 0.0)

@@ -40,6 +40,7 @@ def test_a_shadow_within_another_takes_nothing() -> None:
     places = np.array([[-20.0, -20.0, 20.0, 20.0], [9.0, 0.0, 9.0, 0.0]])
     added, _ = ShadowEdges(np.array([upright, *strip]), 1).added_with_gradient(places)
     assert added[1] == pytest.approx([0.0, -0.48, -0.5, -0.5], abs=0.01)
+    assert ShadowEdges(np.array([upright, *strip]), 1).sunlit(places) == pytest.approx([1, 1, 0, 0])
     both, _ = ShadowEdges(np.array([upright, strip[0]]), 2).added_with_gradient(places)
     assert both[1] == pytest.approx([-0.5, -0.49, -0.5, -0.5], abs=0.01)
 
@@ -80,4 +81,5 @@ def test_without_edges_nothing_is_added(offsets: FloatArray) -> None:
     added, gradient = NO_EDGES.added_with_gradient(offsets)
     assert not added.any()
     assert not gradient.any()
+    assert NO_EDGES.sunlit(offsets).min() == 1.0
     assert NO_EDGES.penalty == 0.0
