@@ -92,9 +92,11 @@ _UNEVEN_EXCESS, _UNEVEN_EXCESS_OF_BINS = 1.9, 3.0
 # that agree along edges inflate the covariance so much: of 58 frames with dirt, one of R 15 px had
 # an excess of 1.3, an inflation of 6.5, and an error of 4.6 σ without levels that vary. In even
 # light, with an excess above 1.2, the largest inflation is 3.5 (the flight of a coarse renderer).
-# Rings below `SMALL_RING_PX` hardly fill a cell: two under highlights, 5 and 6 σ off in even light,
-# had excesses of 0.6 and 0.8 and inflations of 1.8 and 2.2; of 120 in even light three have both.
-_DOUBTFUL, _DOUBTFUL_IN_SMALL_RING = (1.2, 4.0), (0.5, 1.6)
+# Rings below `SMALL_RING_PX` hardly fill a cell, and white that is burnt does not vary. Two under
+# highlights, 5 and 6 σ off in even light, had excesses of 0.6 and 0.8 and inflations of 1.8 and
+# 2.2; two that were burnt and half in shade, 7 σ off, 0.3 and 0.4, and 3.3 and 2.7. So inflation is
+# enough there: levels that vary must be likelier besides.
+_DOUBTFUL, _DOUBTFUL_IN_SMALL_RING = (1.2, 4.0), 1.6
 _TELLING_POWER = 0.05  # of the cell that tells most
 
 
@@ -136,9 +138,12 @@ def needs_varying_levels(fit: TargetFit) -> bool:
     excess, is_binned = excess_of_cells(fit), fit.sample.problem.window.binning > 1
     if excess > (_UNEVEN_EXCESS_OF_BINS if is_binned else _UNEVEN_EXCESS):
         return True
-    is_small = fit.sample.problem.is_ring_small
-    doubtful, inflation = _DOUBTFUL_IN_SMALL_RING if is_small else _DOUBTFUL
-    return excess > doubtful and not is_binned and pose_covariance(fit).inflation > inflation
+    if is_binned:
+        return False
+    if fit.sample.problem.is_ring_small:
+        return pose_covariance(fit).inflation > _DOUBTFUL_IN_SMALL_RING
+    doubtful, inflation = _DOUBTFUL
+    return excess > doubtful and pose_covariance(fit).inflation > inflation
 
 
 def fit_levels(

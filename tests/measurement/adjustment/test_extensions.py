@@ -73,7 +73,8 @@ def test_the_other_base_is_tried_where_levels_leave_residuals_that_agree(
         (3.1, 1.0, 90.0, 2, True),
         (0.6, 1.8, 10.0, 1, True),  # a highlight on a ring of 8 px
         (0.6, 1.4, 10.0, 1, False),
-        (0.4, 6.5, 10.0, 1, False),
+        (0.3, 3.3, 10.0, 1, True),  # a burnt ring of 8 px, half in shade
+        (0.3, 1.4, 10.0, 1, False),
     ],
 )
 def test_cells_ask_for_levels_and_edges_where_cells_leave_a_doubt(
