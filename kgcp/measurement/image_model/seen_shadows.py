@@ -41,7 +41,7 @@ _ALMOST_NOTHING = 1e-6  # of full scale
 # Change of ink by that of plate: shade takes from both what they have, a highlight adds to both.
 _LEAST_BY_INK, _MOST_BY_INK = -0.2, 0.6
 _BURNT = 0.02  # of the contrast: so near to the limit, white may be anything above
-_MOST_INK = 0.2  # of the plate's level; under a highlight, ink is brighter
+_MOST_INK = 0.13  # of the plate's level; under a highlight, ink is brighter
 
 
 @dataclass(frozen=True, slots=True, eq=False)
