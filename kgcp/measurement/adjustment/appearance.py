@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 from scipy.special import ndtri
@@ -27,7 +26,7 @@ TONE_OF_BASE = {ToneBase.SRGB: Tone.UNKNOWN, ToneBase.LINE: Tone.UNKNOWN_FROM_LI
 """The tone of a fit, by the base that it departs from."""
 _BASE_OF_TONE = {tone: base for base, tone in TONE_OF_BASE.items()}
 _NEAR_EDGE = 0.3  # of the white share, from a half
-_LEAST_SHARE = 1e-3
+_LEAST_SHARE, _LEAST_CONTRAST = 1e-3, 0.05
 _LIGHTS = 400  # of which the grey value is computed
 
 
@@ -59,33 +58,31 @@ def _edge_shift_px(fit: TargetFit) -> float:
     The apparent edge is where the grey value passes midway between the plateaus as they are seen,
     clipped; the true one is where half the light comes from either side.
     """
-    high = fit.sample.problem.censoring.high
-
-    def midway(ink: FloatArray, plate: FloatArray) -> FloatArray:
-        return np.asarray(0.5 * (ink + np.minimum(plate, high)))
-
-    return -float(np.mean(places_across_edges_px(fit, midway)))
+    return -float(np.mean(places_across_edges_px(fit, None)))
 
 
-def places_across_edges_px(
-    fit: TargetFit, level_between: Callable[[FloatArray, FloatArray], FloatArray]
-) -> FloatArray:
-    """Return how far from a straight edge, towards white, grey values are reached (n,) [px].
+def places_across_edges_px(fit: TargetFit, level: float | None) -> FloatArray:
+    """Return how far from a straight edge, towards white, a grey value is reached (n,) [px].
 
-    `level_between` gives them by those of ink and plate beside the edge (n,), not clipped. In even
-    light there is one; otherwise there is one for every pixel near an edge.
+    None is the one midway between both sides of the edge as they are seen, clipped. In even light
+    there is one place; otherwise there is one for every pixel near an edge.
     """
-    light, tone, field = fit.parameters.light, fit.sample.problem.tone, fit.parameters.field
+    light, problem, field = fit.parameters.light, fit.sample.problem, fit.parameters.field
+    tone, high = problem.tone, problem.censoring.high
     if field is None:
-        ink, plate = (np.array([level]) for level in plateau_levels(light, tone))
-        shares = np.array([share_at(float(level_between(ink, plate)[0]), light, tone)])
+        black, white = plateau_levels(light, tone)
+        wanted = 0.5 * (black + min(white, high)) if level is None else level
+        shares = np.array([share_at(wanted, light, tone)])
     else:
-        near = np.abs(fit.prediction.share - 0.5) < _NEAR_EDGE
+        off = np.abs(fit.prediction.share - 0.5)
+        near = off <= max(_NEAR_EDGE, float(off.min()))
         ink, plate = np.array([[0.0], [1.0]]) + field.added(fit.sample.pixels[:, near])
-        levels = level_between(*(encoded(toned(x, light.values), tone) for x in (ink, plate)))
         lights = np.linspace(float(ink.min()), float(plate.max()), _LIGHTS)
         rising = np.maximum.accumulate(encoded(toned(lights, light.values), tone))
-        shares = (np.interp(levels, rising, lights) - ink) / (plate - ink)
+        dark, bright = (np.interp(side, lights, rising) for side in (ink, plate))
+        midway = 0.5 * (dark + np.minimum(bright, high))
+        reached = np.interp(midway if level is None else level, rising, lights)
+        shares = (reached - ink) / np.maximum(plate - ink, _LEAST_CONTRAST)
     shares = np.clip(shares, _LEAST_SHARE, 1.0 - _LEAST_SHARE)
     return np.asarray(fit.parameters.blur.mean_sd_px * ndtri(shares))
 

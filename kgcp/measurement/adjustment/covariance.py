@@ -251,8 +251,8 @@ def _halo_displacement_px(light: Light) -> float:
 def _clipped_reach_px(fit: TargetFit) -> float:
     """Return how far the middle of a straight edge is within what is clipped, in the mean [px]."""
     limits = fit.sample.problem.censoring
-    burnt = places_across_edges_px(fit, lambda *beside: np.full(len(beside[0]), limits.high))
-    sunk = places_across_edges_px(fit, lambda *beside: np.full(len(beside[0]), limits.low))
+    burnt = places_across_edges_px(fit, limits.high)
+    sunk = places_across_edges_px(fit, limits.low)
     return float(np.mean(np.maximum(0.0, np.maximum(-burnt, sunk))))
 
 

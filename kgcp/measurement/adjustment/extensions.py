@@ -283,7 +283,7 @@ def _under_shadows(problem: FitProblem, first: Parameters, seen: SeenShadows) ->
     falls = rows[:, INK:].sum(axis=1, keepdims=True) < 0.0
     steps = np.where(falls, rows[:, INK:], -rows[:, INK:])
     beyond = decoded(np.maximum(seen.lit + steps, 0.0), problem.tone)
-    ink, plate = decoded(seen.lit, problem.tone).tolist()
+    ink, plate = decoded(np.maximum(seen.lit, 0.0), problem.tone).tolist()
     # by a curve that is not known, the white that is seen is the scale
     if seen.is_burnt(problem.censoring.high) and not problem.tone.is_unknown:
         plate = _burnt_white(ink, plate, beyond)
@@ -300,6 +300,8 @@ def _burnt_white(ink: float, plate: float, beyond: FloatArray) -> float:
     Shade leaves the same share of ink and of plate, and what it leaves of ink is seen. `beyond`
     (s, 2) are the levels of ink and plate there.
     """
+    if ink <= 0.0:
+        return plate
     left = np.clip(beyond[:, 0] / ink, 1.0 / _MOST_BURNT, 1.0)
     return float(np.clip(np.max(beyond[:, 1] / left), plate, _MOST_BURNT * plate))
 

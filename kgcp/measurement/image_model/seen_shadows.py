@@ -110,11 +110,14 @@ def _may_be_shade(seen: SeenShadows, high: float, tone: Tone) -> bool:
 
     Where white is burnt, shade need not show on it but on ink, which is dark without a highlight.
     """
+    if not seen.lit[0] < seen.lit[1]:
+        return False
     by_ink, by_plate = seen.edges.rows[:, INK], seen.edges.rows[:, PLATE]
     ratios = by_ink / np.where(by_plate == 0.0, _ALMOST_NOTHING, by_plate)
     if np.all((ratios > _LEAST_BY_INK) & (ratios < _MOST_BY_INK)):
         return True
-    ink, plate = decoded(seen.lit, Tone.SRGB if tone.is_unknown else tone).tolist()
+    light = decoded(np.maximum(seen.lit, 0.0), Tone.SRGB if tone.is_unknown else tone)
+    ink, plate = light.tolist()
     against = by_plate * np.sign(by_ink) < -_BURNT
     shows_on_ink = by_ink * (by_ink + by_plate) > 0.0
     is_dark = seen.is_burnt(high) and ink < _MOST_INK * plate

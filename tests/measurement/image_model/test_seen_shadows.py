@@ -108,6 +108,17 @@ def test_what_ink_alone_shows_is_no_light() -> None:
     assert find_shadows(FlatPixels(flat.offsets, flat.kind, levels, HIGH), Tone.LINEAR) == []
 
 
+@pytest.mark.parametrize(("ink", "plate"), [(0.0, 1.0), (0.4, 0.4), (0.8, 0.3), (0.0, 0.0)])
+def test_without_noise_or_contrast_there_are_no_shadows(ink: float, plate: float) -> None:
+    flat = flat_under([], 0)
+    levels = np.where(flat.kind, plate, ink)
+    assert find_shadows(FlatPixels(flat.offsets, flat.kind, levels, HIGH), Tone.LINEAR) == []
+
+
+def test_ink_that_is_brighter_than_plate_is_in_no_shade() -> None:
+    assert find_shadows(flat_under([EDGE], 1, ink=0.7, plate=0.2), Tone.LINEAR) == []
+
+
 def test_the_step_that_is_found_explains_most_of_all() -> None:
     """Against sums over every pair of borders, by masks."""
     rng = np.random.default_rng(8)
