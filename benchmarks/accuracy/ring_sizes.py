@@ -53,20 +53,17 @@ _CAMERAS = {
     ),
     "consumer": preset("consumer"),
 }
+_BURNT: dict[str, object] = {"gain": (1.15, 2.2)}
+_HALF_IN_SHADE: dict[str, object] = {"shadow": Shadow(light_left=0.5, edges=1, stripes=0)}
+_ANTENNAS_SHADOW: dict[str, object] = {"shadow": Shadow(light_left=0.6, edges=0, stripes=1)}
 _LIGHTS: dict[str, dict[str, object]] = {
     "even": {},
-    "burnt": {"gain": (1.15, 2.2)},
-    "half in shade": {"shadow": Shadow(light_left=0.5, edges=1, stripes=0)},
-    "antenna's shadow": {"shadow": Shadow(light_left=0.6, edges=0, stripes=1)},
+    "burnt": _BURNT,
+    "half in shade": _HALF_IN_SHADE,
+    "antenna's shadow": _ANTENNAS_SHADOW,
     "both shadows": {"shadow": Shadow(light_left=0.5, edges=1, stripes=1)},
-    "burnt, half in shade": {
-        "gain": (1.15, 2.2),
-        "shadow": Shadow(light_left=0.5, edges=1, stripes=0),
-    },
-    "burnt, antenna's": {
-        "gain": (1.15, 2.2),
-        "shadow": Shadow(light_left=0.6, edges=0, stripes=1),
-    },
+    "burnt, half in shade": {**_BURNT, **_HALF_IN_SHADE},
+    "burnt, antenna's": {**_BURNT, **_ANTENNAS_SHADOW},
     "dirt": {"dirt": Dirt()},
     "highlights": {"glare": Glare()},
 }
@@ -193,14 +190,14 @@ def main(
     """Print the table."""
     aberration = Aberration(astigmatism=astigmatism, coma=coma, defocus_px=defocus)
     lens = None if aberration == Aberration() else aberration
-    print("camera    light             found  error [%]  z mean   z RMS  > 3  z of centre  ms")
+    print("camera    light                 found  error [%]  z mean   z RMS  > 3  z of centre  ms")
     for camera in cameras:
         for light in _LIGHTS:
             settings = settings_of(camera, light, frames, SIZES[size], quality)
             errors = errors_of(replace(settings, lens=lens), seed, jobs or usable_cores())
             z = errors.distance
             print(
-                f"{camera:10s}{light:18s}{len(z):5d}{100.0 * rms(errors.relative):11.4f}"
+                f"{camera:10s}{light:22s}{len(z):5d}{100.0 * rms(errors.relative):11.4f}"
                 f"{z.mean():8.2f}{rms(z):8.2f}{np.count_nonzero(np.abs(z) > 3.0):5d}"
                 f"{rms(errors.centre):13.2f}{1e3 * errors.seconds:5.0f}",
                 flush=True,

@@ -95,7 +95,8 @@ _UNEVEN_EXCESS, _UNEVEN_EXCESS_OF_BINS = 1.9, 3.0
 # Rings below `SMALL_RING_PX` hardly fill a cell, and white that is burnt does not vary. Two under
 # highlights, 5 and 6 σ off in even light, had excesses of 0.6 and 0.8 and inflations of 1.8 and
 # 2.2; two that were burnt and half in shade, 7 σ off, 0.3 and 0.4, and 3.3 and 2.7. So inflation is
-# enough there: levels that vary must be likelier besides.
+# enough there: levels that vary must be likelier besides. In even light, of 159 such rings that are
+# burnt, two are refused for it.
 _DOUBTFUL, _DOUBTFUL_IN_SMALL_RING = (1.2, 4.0), 1.6
 _TELLING_POWER = 0.05  # of the cell that tells most
 

@@ -5,9 +5,9 @@ one shade hides the sun, another takes nothing more. So what edges add is not a 
 
     added = Σ_j a_j Φ_j Π_i (1 − Φ_i),
 
-with a_j what edge j adds to the level of ink or plate, Φ_j the share of its penumbra (a Gaussian's)
-that lies before a place, and i the edges before j that are shades with one edge. Of a shade between
-two edges, the second one adds back what the first one takes.
+with a_j what edge j adds to the level of ink or plate, Φ_j how much of that is reached at a place
+(the normal distribution of its distance), and i the edges before j that bound a shade alone. Of a
+shade between two edges, the second edge adds back what the first one takes.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class ShadowEdges:
     # (s, 5): direction of an edge's normal [rad], offset along that from the centre [px], logarithm
     # of the penumbra's σ [px], and what is added beyond to the levels of ink and plate
     rows: FloatArray
-    # of the rows, the first so many are shades with one edge; pairs of edges follow
-    single: int
+    # how many rows, the first ones, bound a shade alone; pairs follow, with a shade between them
+    alone_count: int
 
     @property
     def penalty(self) -> float:
@@ -61,18 +61,18 @@ class ShadowEdges:
         """
         if not len(self.rows):
             return np.zeros(offsets.shape), np.zeros(offsets.shape)
-        z, beyond, lit = self._seen_from(offsets)
-        added = self.rows[:, INK:].T @ (beyond * lit)
+        z, beyond, sun = self._seen_from(offsets)
+        added = self.rows[:, INK:].T @ (beyond * sun)
         contrast = self.rows[:, PLATE] - self.rows[:, INK]
-        by_z = self._by_sigmas(contrast[:, None], z, beyond, lit)
+        by_z = self._by_sigmas(contrast[:, None], z, beyond, sun)
         angle, _, log_width = self.rows[:, :INK].T
         per_px = np.exp(-log_width)
         return added, np.stack(((np.cos(angle) * per_px) @ by_z, (np.sin(angle) * per_px) @ by_z))
 
     def derivatives(self, offsets: FloatArray, by_level: FloatArray) -> FloatArray:
         """Return derivatives (5 s, n) by the rows, given those by the levels, (2, n)."""
-        z, beyond, lit = self._seen_from(offsets)
-        by_z = self._by_sigmas(self.rows[:, INK:] @ by_level, z, beyond, lit)
+        z, beyond, sun = self._seen_from(offsets)
+        by_z = self._by_sigmas(self.rows[:, INK:] @ by_level, z, beyond, sun)
         derivatives = np.empty((len(self.rows), 5, offsets.shape[1]))
         for k, (angle, _, log_width, _, _) in enumerate(self.rows.tolist()):
             across = math.cos(angle) * offsets[1] - math.sin(angle) * offsets[0]
@@ -80,35 +80,35 @@ class ShadowEdges:
             derivatives[k, ANGLE] = by_z[k] * across * per_px
             derivatives[k, OFFSET] = -by_z[k] * per_px
             derivatives[k, LOG_WIDTH] = -by_z[k] * z[k]
-            derivatives[k, INK:] = by_level * (beyond[k] * lit[k])
+            derivatives[k, INK:] = by_level * (beyond[k] * sun[k])
         return derivatives.reshape(-1, offsets.shape[1])
 
-    def sunlit(self, offsets: FloatArray) -> FloatArray:
-        """Return the share of the sun (n,) that shades with one edge leave at places (2, n)."""
-        if not self.single:
+    def sun_left(self, offsets: FloatArray) -> FloatArray:
+        """Return the share of the sun (n,) that edges alone leave at places (2, n)."""
+        if not self.alone_count:
             return np.ones(offsets.shape[1])
         _, beyond, _ = self._seen_from(offsets)
-        return np.asarray(np.prod(1.0 - beyond[: self.single], axis=0))
+        return np.asarray(np.prod(1.0 - beyond[: self.alone_count], axis=0))
 
     def _seen_from(self, offsets: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return how far places are beyond each edge, in σ of its penumbra and as Φ of that.
+        """Return how far places are beyond each edge, in σ of its penumbra, and Φ of that.
 
-        The third one is the share of the sun that shades before an edge leave. All are (s, n).
+        The third one is the share of the sun that the edges before it leave. All are (s, n).
         """
         angle, offset_px, log_width = self.rows[:, :INK].T[:, :, None]
         along = np.cos(angle) * offsets[0] + np.sin(angle) * offsets[1]
         z = (along - offset_px) * np.exp(-log_width)
-        beyond, lit = ndtr(z), np.ones(z.shape)
-        for k in range(self.single):
-            lit[k + 1 :] *= 1.0 - beyond[k]
-        return z, beyond, lit
+        beyond, sun = ndtr(z), np.ones(z.shape)
+        for k in range(self.alone_count):
+            sun[k + 1 :] *= 1.0 - beyond[k]
+        return z, beyond, sun
 
     def _by_sigmas(
-        self, added: FloatArray, z: FloatArray, beyond: FloatArray, lit: FloatArray
+        self, added: FloatArray, z: FloatArray, beyond: FloatArray, sun: FloatArray
     ) -> FloatArray:
-        """Return the derivatives (s, n) by z of Σ added Φ lit."""
-        terms, by_beyond = added * beyond * lit, added * lit
-        for k in range(min(self.single, len(terms) - 1)):
+        """Return the derivatives (s, n) by z of Σ added Φ(z) sun."""
+        terms, by_beyond = added * beyond * sun, added * sun
+        for k in range(min(self.alone_count, len(terms) - 1)):
             by_beyond[k] -= terms[k + 1 :].sum(axis=0) / np.maximum(1.0 - beyond[k], _LEAST_SHARE)
         return np.asarray(by_beyond * np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi))
 

@@ -10,10 +10,14 @@ import pytest
 
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment import extensions, random_levels
+from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.random_levels import needs_varying_levels
 from kgcp.measurement.image_model.blur import Blur
-from kgcp.measurement.image_model.photometry import Tone
+from kgcp.measurement.image_model.light_field import LightField, knots_over
+from kgcp.measurement.image_model.photometry import Tone, encoded
+from kgcp.measurement.image_model.seen_shadows import SeenShadows
+from kgcp.measurement.image_model.shadow_edges import NO_EDGES, ShadowEdges
 from kgcp.measurement.records import ToneBase
 
 
@@ -141,3 +145,56 @@ def test_bins_in_nearly_even_light_keep_the_levels_that_they_were_fitted_with(
     pose = Pose(np.eye(3), np.array([0.0, 0.0, 9.0]))
     extensions._fit_in_any_light(problem, pose, Blur(0.5, 0.5, 0.0), lambda: seen)
     assert started_from == [seen if starts_from_seen else None]
+
+
+STEP, STRIP = [0.9, 4.0, 0.8], [[2.5, 8.0, 0.3], [2.5, 16.0, 0.3]]
+
+
+def started_under(
+    monkeypatch: pytest.MonkeyPatch, tone: Tone, lit: tuple[float, float], rows: list[list[float]]
+) -> Parameters:
+    knots = knots_over(0.0, 0.0, 64, 48, (8.0,))
+    nothing = np.zeros((2, sum(knots.counts)))
+    even = LightField(knots, nothing, nothing, np.zeros(2), NO_EDGES, np.zeros(2))
+    monkeypatch.setattr(extensions, "even_field", lambda _: even)
+    first = stand_in(pose=Pose(np.eye(3), np.array([0.0, 0.0, 9.0])), blur=Blur(0.5, 0.5, 0.0))
+    problem = stand_in(tone=tone, censoring=stand_in(high=0.998))
+    alone_count = len(rows) % 2
+    seen = SeenShadows(np.array(lit), ShadowEdges(np.array(rows), alone_count))
+    return extensions._under_shadows(problem, first, seen)
+
+
+@pytest.mark.parametrize("tone", [Tone.LINEAR, Tone.SRGB])
+def test_fits_start_from_the_light_of_shadows_that_are_seen(
+    monkeypatch: pytest.MonkeyPatch, tone: Tone
+) -> None:
+    """What edges add is relative to the contrast of the light, which half in shade is half."""
+    light = np.array(((0.06, 0.7), (0.03, 0.35)))
+    lit, shade = encoded(light[0], tone), encoded(light[1], tone)
+    step = (shade - lit).tolist()
+    rows = [[*STEP, *step], [*STRIP[0], *step], [*STRIP[1], *(lit - shade).tolist()]]
+    start = started_under(monkeypatch, tone, tuple(lit.tolist()), rows)
+    assert (start.light.black, start.light.white) == pytest.approx((0.06, 0.7))
+    assert start.field is not None
+    added = (light[1] - light[0]) / (0.7 - 0.06)
+    assert start.field.shadows.rows[:, 3:] == pytest.approx(np.array([added, added, -added]))
+    assert start.field.shadows.alone_count == 1
+
+
+@pytest.mark.parametrize(
+    ("tone", "plate_in_shade", "white"),
+    [
+        (Tone.LINEAR, 0.75, 1.5),  # half of ink is left, so half of the plate
+        (Tone.LINEAR, 1.0, 2.0),
+        (Tone.UNKNOWN_FROM_LINE, 0.75, 1.0),  # the white that is seen is the scale
+    ],
+)
+def test_ink_tells_how_bright_burnt_white_is(
+    monkeypatch: pytest.MonkeyPatch, tone: Tone, plate_in_shade: float, white: float
+) -> None:
+    rows = [[*STEP, -0.05, plate_in_shade - 1.0]]
+    start = started_under(monkeypatch, tone, (0.1, 1.0), rows)
+    assert start.light.white == pytest.approx(white)
+    assert start.field is not None
+    shade = start.light.white + (white - 0.1) * start.field.shadows.rows[0, 4]
+    assert shade == pytest.approx(plate_in_shade)

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.measurement.image_model.photometry import Tone
@@ -19,7 +20,6 @@ from kgcp.measurement.image_model.seen_shadows import (
     _best_step,
     find_shadows,
 )
-from kgcp.measurement.image_model.shadow_edges import ShadowEdges
 
 RADIUS_PX, NOISE, HIGH = 45.0, 0.004, 0.998
 EDGE = [0.9, 4.0, 0.8]
@@ -27,29 +27,34 @@ STRIP = [[2.5, 8.0, 0.3], [2.5, 16.0, 0.3]]
 
 
 def flat_under(
-    shares: list[list[float]],
-    single: int,
+    edges: list[list[float]],
+    strip: list[list[float]],
     ink: float = 0.08,
     plate: float = 0.75,
     left: float = 0.5,
 ) -> FlatPixels:
-    """Ink within a ring, plate beside it; shades leave the same share of both."""
+    """Return plate within half of the radius and ink around it.
+
+    Shades beyond edges, and one along a strip, leave the same share of both.
+    """
     rng = np.random.default_rng(3)
     y, x = np.mgrid[-RADIUS_PX:RADIUS_PX, -RADIUS_PX:RADIUS_PX] + 0.3
     offsets = np.stack((x[np.hypot(x, y) < RADIUS_PX], y[np.hypot(x, y) < RADIUS_PX]))
     kind = (np.hypot(*offsets) < 0.5 * RADIUS_PX).astype(np.intp)
-    light = _light(shares, single, offsets, left)
+    sun = np.prod([1.0 - beyond(line, offsets) for line in edges], axis=0)
+    if strip:
+        near, far = (beyond(line, offsets) for line in strip)
+        sun = sun * (1.0 - (near - far))
+    light = left + (1.0 - left) * sun
     levels = np.where(kind, plate, ink) * light + NOISE * rng.standard_normal(len(kind))
     return FlatPixels(offsets, kind, np.clip(levels, 0.0, 1.0), HIGH)
 
 
-def _light(lines: list[list[float]], single: int, offsets: FloatArray, left: float) -> FloatArray:
-    if not lines:
-        return np.ones(offsets.shape[1])
-    signs = [1.0 if k <= single or (k - single) % 2 == 0 else -1.0 for k in range(len(lines))]
-    rows = [[*line, 0.0, -sign * (1.0 - left)] for line, sign in zip(lines, signs, strict=True)]
-    added, _ = ShadowEdges(np.array(rows), single).added_with_gradient(offsets)
-    return np.asarray(1.0 + added[1])
+def beyond(line: list[float], offsets: FloatArray) -> FloatArray:
+    """Return the share of a penumbra that is passed at places (2, n)."""
+    angle, offset_px, log_width = line
+    along_px = math.cos(angle) * offsets[0] + math.sin(angle) * offsets[1]
+    return np.asarray(ndtr((along_px - offset_px) / math.exp(log_width)))
 
 
 def lines_of(seen: SeenShadows) -> FloatArray:
@@ -59,12 +64,12 @@ def lines_of(seen: SeenShadows) -> FloatArray:
 
 
 def test_even_light_has_no_shadows() -> None:
-    assert find_shadows(flat_under([], 0), Tone.LINEAR) == []
+    assert find_shadows(flat_under([], []), Tone.LINEAR) == []
 
 
 def test_one_edge_is_a_shade_of_its_own() -> None:
-    (seen,) = find_shadows(flat_under([EDGE], 1), Tone.LINEAR)
-    assert seen.edges.single == 1
+    (seen,) = find_shadows(flat_under([EDGE], []), Tone.LINEAR)
+    assert seen.edges.alone_count == 1
     assert lines_of(seen)[0] == pytest.approx(EDGE[:2], abs=0.2)
     assert seen.lit == pytest.approx([0.08, 0.75], abs=0.002)
     assert seen.edges.rows[0, 3:] == pytest.approx([-0.04, -0.375], abs=0.003)
@@ -72,23 +77,23 @@ def test_one_edge_is_a_shade_of_its_own() -> None:
 
 
 def test_a_strip_has_two_edges_and_hides_nothing() -> None:
-    seen = find_shadows(flat_under(STRIP, 0), Tone.LINEAR)[0]
-    assert seen.edges.single == 0
+    seen = find_shadows(flat_under([], STRIP), Tone.LINEAR)[0]
+    assert seen.edges.alone_count == 0
     assert lines_of(seen) == pytest.approx(np.array(STRIP)[:, :2], abs=0.2)
     assert seen.edges.rows[:, 4] == pytest.approx([-0.375, 0.375], abs=0.02)
 
 
 def test_a_strip_is_told_from_the_shade_that_it_runs_into() -> None:
     """The edge comes first, although the strip adds to what it explains."""
-    first, both = find_shadows(flat_under([EDGE, *STRIP], 1), Tone.LINEAR)
-    assert (first.edges.single, len(first.edges.rows)) == (1, 1)
-    assert (both.edges.single, len(both.edges.rows)) == (1, 3)
+    first, both = find_shadows(flat_under([EDGE], STRIP), Tone.LINEAR)
+    assert (first.edges.alone_count, len(first.edges.rows)) == (1, 1)
+    assert (both.edges.alone_count, len(both.edges.rows)) == (1, 3)
     assert lines_of(both) == pytest.approx(np.array([EDGE, *STRIP])[:, :2], abs=0.2)
     assert both.edges.rows[:, 4] == pytest.approx([-0.375, -0.375, 0.375], abs=0.02)
 
 
 def test_where_white_is_burnt_on_either_side_ink_shows_the_shadow() -> None:
-    flat = flat_under([EDGE], 1, ink=0.12, plate=1.9, left=0.6)
+    flat = flat_under([EDGE], [], ink=0.12, plate=1.9, left=0.6)
     assert flat.levels[flat.kind == 1].min() == 1.0
     (seen,) = find_shadows(flat, Tone.LINEAR)
     assert seen.is_burnt(HIGH)
@@ -98,25 +103,25 @@ def test_where_white_is_burnt_on_either_side_ink_shows_the_shadow() -> None:
 
 def test_a_highlight_beside_which_white_is_burnt_too_is_no_shade() -> None:
     """It adds to ink what it adds to white, which is not seen."""
-    flat = flat_under([EDGE], 1, ink=0.5, plate=1.9, left=0.4)
+    flat = flat_under([EDGE], [], ink=0.5, plate=1.9, left=0.4)
     assert find_shadows(flat, Tone.LINEAR) == []
 
 
 def test_what_ink_alone_shows_is_no_light() -> None:
-    flat = flat_under([], 0)
+    flat = flat_under([], [])
     levels = flat.levels + 0.2 * ((flat.kind == 0) & (flat.offsets[0] > 5.0))
     assert find_shadows(FlatPixels(flat.offsets, flat.kind, levels, HIGH), Tone.LINEAR) == []
 
 
 @pytest.mark.parametrize(("ink", "plate"), [(0.0, 1.0), (0.4, 0.4), (0.8, 0.3), (0.0, 0.0)])
 def test_without_noise_or_contrast_there_are_no_shadows(ink: float, plate: float) -> None:
-    flat = flat_under([], 0)
+    flat = flat_under([], [])
     levels = np.where(flat.kind, plate, ink)
     assert find_shadows(FlatPixels(flat.offsets, flat.kind, levels, HIGH), Tone.LINEAR) == []
 
 
 def test_ink_that_is_brighter_than_plate_is_in_no_shade() -> None:
-    assert find_shadows(flat_under([EDGE], 1, ink=0.7, plate=0.2), Tone.LINEAR) == []
+    assert find_shadows(flat_under([EDGE], [], ink=0.7, plate=0.2), Tone.LINEAR) == []
 
 
 def test_the_step_that_is_found_explains_most_of_all() -> None:
@@ -137,20 +142,15 @@ def test_the_step_that_is_found_explains_most_of_all() -> None:
             explained = by_kind[0] + by_kind[1]
             explained[:-1] *= _BY_STRIP
             if explained.max() > most:
-                most, found = (
-                    float(explained.max()),
-                    (way, near, near + 1 + int(explained.argmax())),
-                )
+                most = float(explained.max())
+                found = way, near, near + 1 + int(explained.argmax())
     assert gain == pytest.approx(most)
+    assert last == number  # a step, not a strip
     assert (angle, first, last) == pytest.approx(found)
     for k, step in enumerate((ink, plate)):
-        own, place = (
-            values[kind == k],
-            (offsets[:, kind == k].T @ (math.cos(angle), math.sin(angle))),
-        )
-        border_px = np.linspace(-reach_px, reach_px, _BORDERS)[first]
-        is_beyond = place >= border_px
-        assert last == number
+        own = values[kind == k]
+        along_px = offsets[:, kind == k].T @ (math.cos(angle), math.sin(angle))
+        is_beyond = along_px >= np.linspace(-reach_px, reach_px, _BORDERS)[first]
         assert step == pytest.approx(own[is_beyond].mean() - own[~is_beyond].mean())
 
 
