@@ -34,7 +34,8 @@ _WIDTHS = np.array((0.07, 0.05))
 _REACH = 0.17  # of an edge from the first curve; the rises into dots are farther in
 _INLIER = 0.07  # distance from the curve of what counts as its edge, twice that at first
 _MIN_INLIERS, _MIN_INLIERS_AT_FIRST = 0.55, 0.6  # shares: up to 40 % may be hidden
-_FINEST_RADIUS_PX = 12.0  # of rings in the image that they are tracked in, or twice that
+FINEST_RADIUS_PX = 12.0
+"""Least radius of rings in the image that they are tracked in; in the frame it may be less."""
 
 _IntArray = npt.NDArray[np.signedinteger[Any]]
 
@@ -110,7 +111,7 @@ def track_edges(
 @inlined
 def _octave_of(radius: float, levels: IndexArray) -> int:
     """Return how often a frame is halved where a ring is tracked."""
-    octave, largest = 0, 2.0 * _FINEST_RADIUS_PX
+    octave, largest = 0, 2.0 * FINEST_RADIUS_PX
     while 2 * octave < len(levels) and radius >= largest:
         octave, largest = octave + 1, 2.0 * largest
     return octave

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
+from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.records import InitialPose
 from kgcp.measurement.search.candidates import find_code, find_dotted, find_rings
@@ -47,6 +49,34 @@ def test_an_outline_gives_a_pose_to_a_per_cent_or_two(
     assert seen.pose.distance_m == pytest.approx(pose.distance_m, rel=0.02)
     assert np.linalg.norm(seen.pose.translation_m - pose.translation_m) < 0.02 * pose.distance_m
     assert abs(seen.edge_shift_px) < 0.3
+
+
+@pytest.mark.parametrize("off_px", [(1.5, -1.0, 0.0, 0.0), (-0.5, 0.5, 2.0, -1.0)])
+def test_an_outline_from_a_reduced_image_is_mended_in_the_frame(
+    off_px: tuple[float, float, float, float],
+    camera: Camera,
+    target: Target,
+    place_plate: PlacePlate,
+    draw_frame: DrawFrame,
+) -> None:
+    """Of rings of 100 px, outlines were off by up to 2 px, and starts tilted by 15° too much."""
+    pose = place_plate((205.4, 160.7), 90.0, tilt_deg=12.0, way_deg=200.0, turn_deg=31.0)
+    single = Target(target.ring)
+    grey = draw_frame((single, pose))
+    grey[: int(pose_row(camera, pose)) - 40, :205] = 90  # hides a part of the edge
+    settings = DetectSettings()
+    candidates = find_dotted(grey, find_rings(grey, settings), single.rings)
+    matches, _ = find_code(candidates[single.ring], single.ring, settings)
+    outer = matches[0].outer
+    x, y, a, b = np.add((outer.x, outer.y, outer.a, outer.b), off_px)
+    displaced = replace(matches[0], outer=Ellipse(x, y, a, b, outer.angle_rad + 0.3))
+    seen = initial_pose(grey, camera, single, displaced).pose
+    assert seen.distance_m == pytest.approx(pose.distance_m, rel=0.01)
+    assert np.degrees(np.arccos(seen.normal @ pose.normal)) < 3.0
+
+
+def pose_row(camera: Camera, pose: Pose) -> float:
+    return float(camera.project(pose.translation_m[None])[0, 1])
 
 
 @pytest.mark.parametrize("blur_px", [0.8, 3.0])
