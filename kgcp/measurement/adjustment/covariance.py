@@ -51,10 +51,9 @@ _VECTOR = 4  # numbers that the processor takes at once
 # Of a circle's edge as a whole: no print and no pixel is known better. That of bins is of the
 # frame's pixels: within bins, a tone curve displaces edges.
 _EDGE_FLOOR_PX, _EDGE_FLOOR_OF_BINS_PX = 0.0005, 0.004
-# Where levels vary, they stand in for halos of sharpening: rings of R ≥ 26 px are too small by
-# 0.0060 ± 0.0009 px times its strength (118 plates in five simulated flights and two of another
-# program). In even light it is 0.0023 ± 0.0005 px (67 plates), and arcs show enough of it.
-_PER_SHARPENING_PX = 0.005
+# Where levels vary, they may stand in for halos of sharpening: sets of 23 to 40 rings of R ≥ 26 px
+# are too large or too small by up to 0.0015 px, at strengths of 0.5 to 0.8 (docs/method.md).
+_PER_SHARPENING_PX = 0.003
 # Variance on small rings, relative to what residuals show of uneven light: where levels vary; and
 # up to so much where they do not, as residuals do not say enough of them
 # (`benchmarks.accuracy.ring_sizes`, without these factors: z of 1.4 in shade and 1.5 with dirt).

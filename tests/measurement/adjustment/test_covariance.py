@@ -203,7 +203,7 @@ def test_edges_of_cameras_that_sharpen_may_be_displaced_where_levels_vary(
     assert common_displacement_px(sharpened, 0.0) == 0.0005
     equations: Any = SimpleNamespace()
     displaced_px = common_displacement_px(replace(sharpened, level_equations=equations), 0.0)
-    assert displaced_px == pytest.approx(math.hypot(0.0005, 0.005 * (behind + before)))
+    assert displaced_px == pytest.approx(math.hypot(0.0005, 0.003 * (behind + before)))
 
 
 @pytest.mark.parametrize(("radius_px", "is_counted"), [(31.0, True), (33.0, False)])
