@@ -232,7 +232,7 @@ def _measurement(
     pose_cov = covariance.pose_cov.copy()
     pose_cov[:3, :3] += spread_over_both(pose, other.parameters.pose, ambiguity)
     if best.level_equations is not None and covariance.inflation > _UNEXPLAINED:
-        pose_cov[:3, :3] += _spread_over_starts(best, other)
+        pose_cov[:3, :3] += _spread_over_starts(best)
     of_other = pose_covariance(other).pose_cov if ambiguity < _DOUBTFUL_SIDE else None
     measurement = Measurement(
         target=target.name,
@@ -251,7 +251,7 @@ def _measurement(
     return with_smoothing(camera, measurement)
 
 
-def _spread_over_starts(best: TargetFit, other: TargetFit) -> FloatArray:
+def _spread_over_starts(best: TargetFit) -> FloatArray:
     """Return what another start adds to the covariance of the translation (3, 3) [m²].
 
     Where the levels do not explain the light, it decides where the fit comes to rest. The other one
@@ -264,6 +264,6 @@ def _spread_over_starts(best: TargetFit, other: TargetFit) -> FloatArray:
     """
     problem, pose = best.sample.problem, best.parameters.pose
     even = replace(best.parameters, field=even_field(problem))
-    again, _ = fit_levels(problem, [even], other.parameters.pose, best.unknowns)
+    again = fit_levels(problem, [even], best.unknowns)
     apart_m = again.parameters.pose.translation_m - pose.translation_m
     return np.asarray(np.outer(apart_m, apart_m))

@@ -6,6 +6,7 @@ the frame itself. docs/method.md, "Light that is not the same everywhere", says 
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import dataclass, replace
 from typing import cast
@@ -147,28 +148,28 @@ def needs_varying_levels(fit: TargetFit) -> bool:
     return excess > doubtful and pose_covariance(fit).inflation > inflation
 
 
-def fit_levels(
-    problem: FitProblem, starts: list[Parameters], other: Pose, unknowns: Unknowns
-) -> tuple[TargetFit, TargetFit]:
-    """Adjust with a field of levels, from the first start that succeeds; then the other pose.
-
-    Returns
-    -------
-    best, other : TargetFit
-        The better and the worse one.
+def fit_levels(problem: FitProblem, starts: list[Parameters], unknowns: Unknowns) -> TargetFit:
+    """Adjust with a field of levels, from the first start that succeeds.
 
     Raises
     ------
     Rejection
         `POOR_FIT`, or as `select_pixels`, if the fits from all starts fail.
     """
-    for start in starts:
-        try:
-            first = _adjust_levels(problem, start, unknowns)
-            break
-        except Rejection:
-            if start is starts[-1]:
-                raise
+    for start in starts[:-1]:
+        with contextlib.suppress(Rejection):
+            return _adjust_levels(problem, start, unknowns)
+    return _adjust_levels(problem, starts[-1], unknowns)
+
+
+def fit_other_pose(first: TargetFit, other: Pose) -> tuple[TargetFit, TargetFit]:
+    """Adjust another pose from the levels, on the pixels and with the noise of a fit.
+
+    Returns
+    -------
+    best, other : TargetFit
+        The better and the worse one.
+    """
     there = moved_to(first, other)
     if there.total > first.total + _HOPELESS_AT_ONCE:
         return first, there

@@ -12,7 +12,7 @@ not a parameter.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum, IntEnum, auto
 
 import numpy as np
@@ -165,6 +165,7 @@ SKEW_PARAMS = [int(Param.SKEW_XXX), int(Param.SKEW_XXY), int(Param.SKEW_XYY), in
 SHAPE_PARAMS = [*SKEW_PARAMS, int(Param.KURTOSIS)]  # what makes a point spread no Gaussian
 _RARE_ROWS = np.array([Param.STREAK_X, Param.STREAK_Y, *SHAPE_PARAMS])
 _SHARE_STEPS = 400
+_CURVE_STEPS = 64  # between ink and plate
 GEOMETRY_ROWS = 11  # of pose and blur, without the shape of the point spread
 # Beyond ink and plate, where curves still follow their formula; light in shade is mostly between.
 _CURVED_BELOW, _CURVED_ABOVE = 0.05, 0.1
@@ -417,6 +418,28 @@ def toned_between(share: FloatArray, light: Light) -> FloatArray:
     arch, lean = share * (1.0 - share), 2.0 * share - 1.0
     tone = share + arch * (light.tone_1 + lean * (light.tone_2 + lean * light.tone_3))
     return np.asarray(light.black + (light.white - light.black) * tone)
+
+
+def light_over(light: Light, tone: Tone, other: Tone) -> Light:
+    """Return the light that has nearly the same grey values over another base of the tone curve.
+
+    Those of ink and plate are the same; between them, the three shapes are fitted by least squares
+    of the light.
+    """
+    share = np.linspace(0.0, 1.0, _CURVE_STEPS + 1)
+    level = decoded(encoded(toned_between(share, light), tone), other)
+    black, white = level[0], level[-1]
+    bend = (level - black) / (white - black) - share
+    shapes = share * (1.0 - share) * (2.0 * share - 1.0) ** np.arange(3)[:, None]
+    tone_1, tone_2, tone_3 = np.linalg.lstsq(shapes.T, bend)[0].tolist()
+    return replace(
+        light,
+        black=float(black),
+        white=float(white),
+        tone_1=tone_1,
+        tone_2=tone_2,
+        tone_3=tone_3,
+    )
 
 
 @compiled

@@ -13,9 +13,10 @@ from kgcp.measurement.adjustment import extensions, random_levels
 from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.random_levels import needs_varying_levels
+from kgcp.measurement.adjustment.unknowns import unknowns_of
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.image_model.light_field import LightField, knots_over
-from kgcp.measurement.image_model.photometry import Tone, encoded
+from kgcp.measurement.image_model.photometry import PARAM_COUNT, Param, Tone, encoded
 from kgcp.measurement.image_model.seen_shadows import SeenShadows
 from kgcp.measurement.image_model.shadow_edges import NO_EDGES, ShadowEdges
 from kgcp.measurement.records import ToneBase
@@ -23,6 +24,22 @@ from kgcp.measurement.records import ToneBase
 
 def stand_in(**members: object) -> Any:  # noqa: ANN401 - for whichever record has these members
     return SimpleNamespace(**members)
+
+
+def problem_of_unknown_tone() -> FitProblem:
+    return FitProblem(
+        window=stand_in(),
+        ring=stand_in(),
+        circles=stand_in(),
+        measured_count=2,
+        outer_radius_m=0.45,
+        outer_radius_px=30.0,
+        centre_px=np.array([160.0, 120.0]),
+        focal_px=900.0,
+        censoring=stand_in(),
+        tone=Tone.UNKNOWN,
+        sharpening_px=1.2,
+    )
 
 
 @pytest.mark.parametrize(
@@ -44,25 +61,74 @@ def test_the_other_base_is_tried_where_levels_leave_residuals_that_agree(
 
     monkeypatch.setattr(extensions, "_fit_in_any_light", fit)
     monkeypatch.setattr(extensions, "pose_covariance", lambda _: stand_in(inflation=inflation))
+    monkeypatch.setattr(extensions, "_is_curve_plausible", lambda _: True)
     monkeypatch.setattr(extensions, "advantage_over", lambda *_: 2.0)
-    problem = FitProblem(
-        window=stand_in(),
-        ring=stand_in(),
-        circles=stand_in(),
-        measured_count=2,
-        outer_radius_m=0.45,
-        outer_radius_px=30.0,
-        centre_px=np.array([160.0, 120.0]),
-        focal_px=900.0,
-        censoring=stand_in(),
-        tone=Tone.UNKNOWN,
-        sharpening_px=1.2,
-    )
+    problem = problem_of_unknown_tone()
     pose = Pose(np.eye(3), np.array([0.0, 0.0, 9.0]))
     fits = extensions.fit_in_any_light(problem, pose, Blur(0.5, 0.5, 0.0), ToneBase.LINE)
     assert tried == tones
     assert fits.untried_base == (None if len(tones) == 2 else ToneBase.SRGB)
     assert (fits.rival is None) == (len(tones) == 1)
+
+
+@pytest.mark.parametrize(("inflation", "is_start"), [(2.9, True), (3.9, False)])
+def test_only_a_fit_at_its_minimum_is_the_start_over_the_other_base(
+    monkeypatch: pytest.MonkeyPatch, *, inflation: float, is_start: bool
+) -> None:
+    poses, starts = stand_in(best=stand_in(level_equations=object())), []
+
+    def fit(*given: object) -> object:
+        starts.append(given[-1])
+        return poses
+
+    monkeypatch.setattr(extensions, "_fit_in_any_light", fit)
+    monkeypatch.setattr(extensions, "pose_covariance", lambda _: stand_in(inflation=inflation))
+    monkeypatch.setattr(extensions, "_is_curve_plausible", lambda _: True)
+    monkeypatch.setattr(extensions, "advantage_over", lambda *_: 2.0)
+    pose = Pose(np.eye(3), np.array([0.0, 0.0, 9.0]))
+    extensions.fit_in_any_light(problem_of_unknown_tone(), pose, Blur(0.5, 0.5, 0.0))
+    assert starts == [None, poses if is_start else None]
+
+
+@pytest.mark.parametrize(
+    ("of_srgb", "of_line", "inflation", "is_srgb_likelier", "has_rival"),
+    [
+        ((0.8, 0.3, -0.6), (1.2, -0.5, 0.0), 1.4, False, True),
+        ((2.2, -1.5, 2.2), (1.2, -0.5, 0.0), 1.4, False, False),  # 8.7 σ off
+        ((0.8, 0.3, -0.6), (1.2, -0.5, 4.4), 1.4, True, False),
+        ((0.8, 0.3, -0.6), (1.2, -0.5, 4.4), 8.0, False, True),  # the other is beside its minimum
+        ((2.2, -1.5, 2.2), (1.2, -0.5, 4.4), 1.4, False, True),
+    ],
+)
+def test_a_fit_with_a_curve_that_no_camera_has_gives_way_to_the_other_base(
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    of_srgb: tuple[float, float, float],
+    of_line: tuple[float, float, float],
+    inflation: float,
+    is_srgb_likelier: bool,
+    has_rival: bool,
+) -> None:
+    def fit(shapes: tuple[float, float, float], tone: Tone) -> Any:  # noqa: ANN401 - a stand-in
+        vector = np.zeros(PARAM_COUNT)
+        vector[[Param.TONE_1, Param.TONE_2, Param.TONE_3]] = shapes
+        unknowns = unknowns_of(stand_in(tone=tone), has_streak=False)
+        parameters = stand_in(vector=vector)
+        best = stand_in(level_equations=object(), parameters=parameters, unknowns=unknowns)
+        return stand_in(best=best)
+
+    monkeypatch.setattr(extensions, "advantage_over", lambda *_: 50.0)  # of the line
+
+    def covariance(fit: Any) -> Any:  # noqa: ANN401 - stand-ins
+        is_plausible = fit.parameters.vector[Param.TONE_3] < 1.0
+        return stand_in(inflation=inflation if is_plausible else 2.5)
+
+    monkeypatch.setattr(extensions, "pose_covariance", covariance)
+    srgb, line = fit(of_srgb, Tone.UNKNOWN), fit(of_line, Tone.UNKNOWN_FROM_LINE)
+    fits = extensions._by_likelihood({ToneBase.SRGB: srgb, ToneBase.LINE: line})
+    assert fits.likelier is (srgb if is_srgb_likelier else line)
+    assert (fits.rival is not None) == has_rival
+    assert extensions._is_at_minimum(srgb.best) == (of_srgb[2] < 1.0 and inflation < 3.0)
 
 
 @pytest.mark.parametrize(
@@ -119,7 +185,7 @@ def test_small_rings_are_in_even_light_where_levels_explain_little_more(
     monkeypatch.setattr(extensions, "_with_levels", lambda *_: varying)
     monkeypatch.setattr(extensions, "advantage_over", lambda *_: advantage)
     pose = Pose(np.eye(3), np.array([0.0, 0.0, 9.0]))
-    chosen = extensions._fit_in_any_light(problem, pose, Blur(0.5, 0.5, 0.0), lambda: None)
+    chosen = extensions._best_in_any_light(problem, pose, Blur(0.5, 0.5, 0.0), lambda: None, None)
     assert chosen is (plain if is_even else varying)
 
 
@@ -143,8 +209,58 @@ def test_bins_in_nearly_even_light_keep_the_levels_that_they_were_fitted_with(
     monkeypatch.setattr(extensions, "_with_levels", with_levels)
     monkeypatch.setattr(extensions, "_may_be_even", lambda *_: True)
     pose = Pose(np.eye(3), np.array([0.0, 0.0, 9.0]))
-    extensions._fit_in_any_light(problem, pose, Blur(0.5, 0.5, 0.0), lambda: seen)
+    extensions._best_in_any_light(problem, pose, Blur(0.5, 0.5, 0.0), lambda: seen, None)
     assert started_from == [seen if starts_from_seen else None]
+
+
+@pytest.mark.parametrize(
+    ("levels_vary", "is_uneven", "fitted_from"),
+    [
+        (False, True, ["evened"]),  # the other base has no levels to start from
+        (True, True, ["other base"]),
+        (True, False, ["plain", "other base"]),  # by this base the light may be even
+    ],
+)
+def test_levels_over_a_second_base_start_from_those_over_the_first(
+    monkeypatch: pytest.MonkeyPatch, *, levels_vary: bool, is_uneven: bool, fitted_from: list[str]
+) -> None:
+    problem = stand_in(is_ring_small=False, may_be_finer=False, tone=Tone.UNKNOWN)
+    sample = stand_in(problem=problem)
+    parameters = stand_in(pose=Pose(np.eye(3), np.array([0.0, 0.0, 9.0])))
+    plain = stand_in(best=stand_in(sample=sample, level_equations=None))
+    varying = stand_in(
+        best=stand_in(sample=sample, level_equations=object()),
+        other=stand_in(parameters=parameters),
+    )
+    over_first_base = stand_in(best=stand_in(level_equations=object() if levels_vary else None))
+    fits: list[str] = []
+
+    def fit_plain(*_: object) -> object:
+        fits.append("plain")
+        return plain
+
+    def fit_evened(*_: object) -> object:
+        fits[-1] = "evened"
+        return varying
+
+    def fit_over_another(_: object, poses: object) -> object:
+        assert poses is over_first_base
+        fits.append("other base")
+        return varying
+
+    monkeypatch.setattr(extensions, "fit_both_poses", fit_plain)
+    monkeypatch.setattr(extensions, "_in_seen_light", fit_evened)
+    monkeypatch.setattr(extensions, "_over_another_base", fit_over_another)
+    monkeypatch.setattr(extensions, "_with_shape", lambda _, poses: poses)
+    monkeypatch.setattr(extensions, "_with_kurtosis", lambda _, poses: poses)
+    monkeypatch.setattr(extensions, "needs_varying_levels", lambda _: True)
+    monkeypatch.setattr(extensions, "fit_other_pose", lambda best, _: (best, None))
+    seen = stand_in(is_uneven=is_uneven)
+    poses = extensions._fit_in_any_light(
+        problem, parameters.pose, Blur(0.5, 0.5, 0.0), lambda: seen, over_first_base
+    )
+    assert fits == fitted_from
+    assert poses.best is varying.best
 
 
 STEP, STRIP = [0.9, 4.0, 0.8], [[2.5, 8.0, 0.3], [2.5, 16.0, 0.3]]

@@ -26,6 +26,7 @@ from kgcp.measurement.image_model.photometry import (
     decoded,
     encoded,
     light_after_step,
+    light_over,
     plateau_levels,
     toned,
     toned_between,
@@ -278,3 +279,29 @@ def test_a_step_never_leaves_a_blur_that_cannot_be() -> None:
         blur = start.moved(step).blur
         assert np.linalg.eigvalsh([[blur.xx, blur.xy], [blur.xy, blur.yy]])[0] > 0.0
         assert 0.5 * (blur.xx + blur.yy) > 1.0 / 13.5, "a pixel alone spreads by 1/12"
+
+
+FILM = Light(0.0, 1.0, tone_1=0.73, tone_2=0.34, tone_3=-0.78)  # as of sRGB's curve
+
+
+@pytest.mark.parametrize(
+    ("tone", "other", "light"),
+    [
+        (Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE, replace(FILM, black=0.02, white=1.007)),
+        (Tone.UNKNOWN_FROM_LINE, Tone.UNKNOWN, Light(0.13, 0.95, tone_1=1.2, tone_2=-0.45)),
+        (Tone.UNKNOWN, Tone.UNKNOWN, LIGHT),
+    ],
+)
+def test_over_another_base_a_curve_keeps_its_grey_values(
+    tone: Tone, other: Tone, light: Light
+) -> None:
+    share = np.linspace(0.0, 1.0, 41)
+    same = light_over(light, tone, other)
+    before, after = (
+        encoded(toned_between(share, each), base) for each, base in ((light, tone), (same, other))
+    )
+    assert after[[0, -1]] == pytest.approx(before[[0, -1]], abs=1e-9)
+    assert np.abs(after - before).max() < 0.04
+    assert (same.sharpening, same.slope_x) == (light.sharpening, light.slope_x)
+    if other is tone:
+        assert same.values == pytest.approx(light.values, abs=1e-9)
