@@ -6,6 +6,7 @@ The plain model is fitted first. If its residuals need no extension, its result 
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -147,20 +148,18 @@ def with_untried_base(fits: FitsByTone, problem: FitProblem, pose: Pose, blur: B
 def _by_likelihood(fits: Mapping[ToneBase, TwoPoses]) -> FitsByTone:
     """Return the fits over one base or both, the likelier one first.
 
-    One with a curve that no camera has counts as failed, if the other has none such and its
-    residuals agree less, too.
+    If only one of both has a plausible curve, and its residuals agree less, the other one counts as
+    failed.
     """
     if len(fits) == 1:
         (alone,) = fits.values()
         return FitsByTone(alone, None)
-    plausible, implausible = (
-        [poses for poses in fits.values() if _is_curve_plausible(poses.best) == is_plausible]
-        for is_plausible in (True, False)
-    )
-    if plausible and implausible:
-        inflations = [pose_covariance(one.best).inflation for one in (*plausible, *implausible)]
-        if inflations[0] < inflations[1]:
-            return FitsByTone(plausible[0], None)
+    plausible = [poses for poses in fits.values() if _is_curve_plausible(poses.best)]
+    if len(plausible) == 1:
+        (kept,) = plausible
+        (other,) = (poses for poses in fits.values() if poses is not kept)
+        if _inflation(kept.best) < _inflation(other.best):
+            return FitsByTone(kept, None)
     over_srgb, over_line = fits[ToneBase.SRGB], fits[ToneBase.LINE]
     advantage = advantage_over(over_srgb.best, over_line.best)
     if advantage > 0.0:
@@ -172,12 +171,19 @@ def _is_at_minimum(fit: TargetFit) -> bool:
     """Tell whether nothing suggests that a fit has ended beside its minimum."""
     if fit.level_equations is None:
         return True
-    is_plausible = _is_curve_plausible(fit)
-    return is_plausible and pose_covariance(fit).inflation < _OFF_MINIMUM_INFLATION
+    return _is_curve_plausible(fit) and _inflation(fit) < _OFF_MINIMUM_INFLATION
+
+
+def _inflation(fit: TargetFit) -> float:
+    """Return by how much residuals inflate the covariance; infinite if there is none."""
+    try:
+        return pose_covariance(fit).inflation
+    except Rejection:
+        return math.inf
 
 
 def _is_curve_plausible(fit: TargetFit) -> bool:
-    """Tell whether some camera may have a fit's tone curve; where the light is even, it may."""
+    """Tell whether a fit with levels that vary has a tone curve that some camera may have."""
     if fit.level_equations is None:
         return True
     shapes = fit.parameters.vector[_CURVE]

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from kgcp.errors import Reason, Rejection
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment import extensions, random_levels
 from kgcp.measurement.adjustment.parameters import Parameters
@@ -90,6 +91,18 @@ def test_only_a_fit_at_its_minimum_is_the_start_over_the_other_base(
     assert starts == [None, poses if is_start else None]
 
 
+def test_a_fit_that_leaves_the_pose_open_is_not_at_its_minimum(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def no_covariance(_: object) -> object:
+        raise Rejection(Reason.POOR_FIT)
+
+    monkeypatch.setattr(extensions, "pose_covariance", no_covariance)
+    monkeypatch.setattr(extensions, "_is_curve_plausible", lambda _: True)
+    fit = stand_in(level_equations=object())
+    assert not extensions._is_at_minimum(fit)
+
+
 @pytest.mark.parametrize(
     ("of_srgb", "of_line", "inflation", "is_srgb_likelier", "has_rival"),
     [
@@ -100,7 +113,7 @@ def test_only_a_fit_at_its_minimum_is_the_start_over_the_other_base(
         ((2.2, -1.5, 2.2), (1.2, -0.5, 4.4), 1.4, False, True),
     ],
 )
-def test_a_fit_with_a_curve_that_no_camera_has_gives_way_to_the_other_base(
+def test_a_fit_with_an_implausible_curve_gives_way_to_the_other_base(
     monkeypatch: pytest.MonkeyPatch,
     *,
     of_srgb: tuple[float, float, float],
