@@ -71,6 +71,10 @@ class SettingError(KgcpError):
         self.problem = problem
         self.remedy = remedy
 
+    def __reduce__(self) -> tuple[type[SettingError], tuple[str, str, str], dict[str, object]]:
+        """Return how a process makes this error again that another one raised."""
+        return type(self), (self.key, self.problem, self.remedy), vars(self)
+
 
 class Status(StrEnum):
     """What became of one target in one frame."""
@@ -261,3 +265,7 @@ class Rejection(Exception):  # noqa: N818 - not an error: the outcome of one fra
         super().__init__(f"{reason.value}: {detail}" if detail else reason.value)
         self.reason = reason
         self.detail = detail
+
+    def __reduce__(self) -> tuple[type[Rejection], tuple[Reason, str], dict[str, object]]:
+        """Return how a process makes this rejection again that another one raised."""
+        return type(self), (self.reason, self.detail), vars(self)
