@@ -37,7 +37,10 @@ def main(flights: Path | None, photos: Path | None, frames: int) -> None:
         of_flights = tuple(print_costs(sources, frames))
         print(cost_line(Costs("flights together", "both", of_flights)), flush=True)
         tuple(print_costs([large_flight(work)], frames))
-        tuple(print_costs(photographs, frames))
+        of_photographs = tuple(print_costs(photographs, frames))
+        if of_photographs:
+            together = Costs("photographs together", "without", of_photographs)
+            print(cost_line(together), flush=True)
         print(jobs_line(sources[0], work), flush=True)
         print(help_line(), flush=True)
         for line in size_lines(photograph_of(photographs, sources[0]), work):
