@@ -51,7 +51,7 @@ _CAMERAS = {
         camera=replace(_CLEAN.camera, response=Response.SRGB),
         sensor=replace(_CLEAN.sensor, tone=ToneCurve.SRGB),
     ),
-    "consumer": preset("consumer"),
+    **{name: preset(name) for name in ("consumer", "phone", "simple_phone")},
 }
 _BURNT: dict[str, object] = {"gain": (1.15, 2.2)}
 _HALF_IN_SHADE: dict[str, object] = {"shadow": Shadow(light_left=0.5, edges=1, stripes=0)}
@@ -190,15 +190,17 @@ def main(
     """Print the table."""
     aberration = Aberration(astigmatism=astigmatism, coma=coma, defocus_px=defocus)
     lens = None if aberration == Aberration() else aberration
-    print("camera    light                 found  error [%]  z mean   z RMS  > 3  z of centre  ms")
+    print(
+        "camera       light                found  error [%] z mean   z RMS  > 3  z of centre   ms"
+    )
     for camera in cameras:
         for light in _LIGHTS:
             settings = settings_of(camera, light, frames, SIZES[size], quality)
             errors = errors_of(replace(settings, lens=lens), seed, jobs or usable_cores())
             z = errors.distance
             print(
-                f"{camera:10s}{light:22s}{len(z):5d}{100.0 * rms(errors.relative):11.4f}"
-                f"{z.mean():8.2f}{rms(z):8.2f}{np.count_nonzero(np.abs(z) > 3.0):5d}"
+                f"{camera:13s}{light:21s}{len(z):5d}{100.0 * rms(errors.relative):11.4f}"
+                f"{z.mean():7.2f}{rms(z):8.2f}{np.count_nonzero(np.abs(z) > 3.0):5d}"
                 f"{rms(errors.centre):13.2f}{1e3 * errors.seconds:5.0f}",
                 flush=True,
             )

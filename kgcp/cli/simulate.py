@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 # Named here, not imported, because reading the presets takes numpy and scipy; a test compares.
 PRESET_NAMES = (
     *("clean", "exposure_sweep", "consumer", "blurred", "oblique", "far", "sample"),
-    *("shadow", "dirty", "glare", "lens", "phone", "rolling", "mixed"),
+    *("shadow", "dirty", "glare", "lens", "phone", "simple_phone", "rolling", "mixed"),
 )
 
 

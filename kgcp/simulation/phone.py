@@ -1,16 +1,23 @@
 """Image processing of a phone: mosaic, noise reduction, local tone mapping.
 
-In this order, in linear light: a Bayer mosaic (RGGB) with noise; white balance; demosaicing by
-Malvar, He & Cutler (ICASSP 2004, High-quality linear interpolation), whose filters are symmetric
-and so move no edge; noise reduction by the guided filter of He, Sun & Tang (PAMI 35, 2013), with
-smoother colours; a gain that follows the surroundings' brightness. Tone curve and sharpening are
-those of the `Sensor`.
+In this order, in linear light: a Bayer mosaic (RGGB) with noise; white balance; demosaicing; noise
+reduction; a gain that follows the surroundings' brightness. Tone curve and sharpening are those of
+the `Sensor`.
+
+Demosaicing is by Malvar, He & Cutler (ICASSP 2004, High-quality linear interpolation), or by the
+mean of the nearest pixels of a colour, whose blur depends on an edge's direction.
+All these filters are symmetric and so move no edge. Noise reduction is the guided filter of He, Sun
+& Tang (PAMI 35, 2013), with smoother colours, or the bilateral filter of Tomasi & Manduchi (ICCV
+1998). The latter makes edges steeper about their middle: of a skew edge, the middle is not where a
+symmetric edge would have it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 
+import cv2
 import numpy as np
 from scipy.ndimage import convolve, uniform_filter
 
@@ -49,15 +56,27 @@ _COLOUR_AT_OTHER = np.array(
         [0, 0, -1.5, 0, 0],
     ]
 ) / 8.0  # fmt: skip
+_MEAN_OF_FOUR = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]]) / 4.0
+_MEAN_OF_NEAREST = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 4.0
+
+
+class Demosaicing(StrEnum):
+    """How the colours that a pixel does not see are filled in."""
+
+    WITH_GRADIENTS = "with_gradients"  # from its own colour, too
+    NEAREST = "nearest"  # from the nearest pixels of that colour alone
 
 
 @dataclass(frozen=True, slots=True)
 class Phone:
     """Settings of a phone's image processing."""
 
+    demosaicing: Demosaicing = Demosaicing.WITH_GRADIENTS
     # differences of fewer noise standard deviations than this are smoothed away; 0: none are
     noise_reduction: float = 2.0
     noise_radius_px: int = 2  # half the side of the smoothing window [px]
+    # σ of a bilateral filter in values from 0 to 1, square roots of the light; 0: the guided filter
+    bilateral: float = 0.0
     # share of the difference in brightness between regions, in logarithms, that is taken away
     local_tone: float = 0.3
     local_tone_px: float = 60.0  # σ of a region [px]
@@ -65,6 +84,7 @@ class Phone:
     def __post_init__(self) -> None:
         require_range("noise_reduction", self.noise_reduction, 0.0, 20.0)
         require_range("noise_radius_px", self.noise_radius_px, 1, 20, unit="px")
+        require_range("bilateral", self.bilateral, 0.0, 1.0)
         require_range("local_tone", self.local_tone, 0.0, 1.0)
         require_range("local_tone_px", self.local_tone_px, 2.0, 1000.0, unit="px")
 
@@ -74,7 +94,11 @@ class Phone:
         """Return a frame (height, width, 3) of red, green and blue values (uint8) with noise."""
         sensitivity = _on_mosaic(irradiance.shape)
         raw = sensor.collect(gain * np.maximum(irradiance, 0.0) * sensitivity, rng)
-        colours = demosaic(np.minimum(raw / sensitivity, 1.0))
+        balanced = np.minimum(raw / sensitivity, 1.0)
+        if self.demosaicing is Demosaicing.NEAREST:
+            colours = demosaic_by_nearest(balanced)
+        else:
+            colours = demosaic(balanced)
         colours = self._smoothed(sensor, np.maximum(colours, 0.0))
         colours *= self._local_gain(_brightness(colours))
         return np.stack(
@@ -83,17 +107,21 @@ class Phone:
         )
 
     def _smoothed(self, sensor: Sensor, colours: FloatArray) -> FloatArray:
+        size = 2 * self.noise_radius_px + 1
+        if self.bilateral:
+            image = np.sqrt(np.moveaxis(colours, 0, -1)).astype(np.float32)
+            smooth = cv2.bilateralFilter(image, size, self.bilateral, self.noise_radius_px)
+            return np.asarray(np.moveaxis(smooth.astype(float) ** 2, -1, 0))
         if not self.noise_reduction:
             return colours
-        size = 2 * self.noise_radius_px + 1
         grey = _brightness(colours)
         mean = uniform_filter(grey, size)
         scatter = np.maximum(uniform_filter(grey * grey, size) - mean * mean, 0.0)
         noise = (sensor.full_well_e * mean + sensor.read_noise_e**2) / sensor.full_well_e**2
         kept = scatter / (scatter + self.noise_reduction**2 * noise)
-        smooth = uniform_filter(kept, size) * grey + uniform_filter((1.0 - kept) * mean, size)
+        even = uniform_filter(kept, size) * grey + uniform_filter((1.0 - kept) * mean, size)
         tints = [uniform_filter(uniform_filter(c - grey, size), size) for c in colours]
-        return np.asarray(np.maximum(smooth + np.stack(tints), 0.0))
+        return np.asarray(np.maximum(even + np.stack(tints), 0.0))
 
     def _local_gain(self, grey: FloatArray) -> FloatArray:
         """Return the gain (height, width) that brings the surroundings nearer to middle grey."""
@@ -121,6 +149,17 @@ def demosaic(raw: FloatArray) -> FloatArray:
         plane[other::2, other::2] = at_other[other::2, other::2]
         planes.append(plane)
     return np.stack((planes[0], green, planes[1]))
+
+
+def demosaic_by_nearest(raw: FloatArray) -> FloatArray:
+    """Return the same as `demosaic`, from the nearest pixels of each colour alone."""
+    planes = np.zeros((3, *raw.shape))
+    planes[0, ::2, ::2], planes[2, 1::2, 1::2] = raw[::2, ::2], raw[1::2, 1::2]
+    planes[1, ::2, 1::2], planes[1, 1::2, ::2] = raw[::2, 1::2], raw[1::2, ::2]
+    kernels = _MEAN_OF_NEAREST, _MEAN_OF_FOUR, _MEAN_OF_NEAREST
+    return np.stack(
+        [convolve(plane, of, mode="mirror") for plane, of in zip(planes, kernels, strict=True)]
+    )
 
 
 def _on_mosaic(shape: tuple[int, ...]) -> FloatArray:

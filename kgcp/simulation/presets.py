@@ -9,7 +9,7 @@ from kgcp.geometry.camera import Camera, Response
 from kgcp.settings import require_range
 from kgcp.simulation.imaging import Sensor, ToneCurve
 from kgcp.simulation.light_settings import Dirt, Glare, Shadow
-from kgcp.simulation.phone import Phone
+from kgcp.simulation.phone import Demosaicing, Phone
 from kgcp.simulation.point_spread import Aberration
 from kgcp.simulation.rolling_shutter import ImageMotion
 
@@ -155,6 +155,12 @@ _PRESETS = (
         name="phone",
         sensor=Sensor(tone=ToneCurve.SRGB, sharpening=0.8, sharpening_px=1.2),
         phone=Phone(),
+    ),
+    replace(
+        _ORDINARY,
+        name="simple_phone",
+        sensor=Sensor(tone=ToneCurve.SRGB, sharpening=0.8, sharpening_px=1.2),
+        phone=Phone(Demosaicing.NEAREST, bilateral=0.2, local_tone=0.0),
     ),
     replace(
         _ORDINARY,
