@@ -222,13 +222,18 @@ def test_both_bases_of_the_tone_curve_see_the_same_pixels_under_a_highlight(
     assert np.abs([srgb / line - 1.0 for srgb, line in counts]).max() < 0.03
 
 
-def phone_photograph(pose: Pose, rng: np.random.Generator) -> GreyArray:
+def phone_photograph(
+    pose: Pose,
+    rng: np.random.Generator,
+    phone: Phone = Phone(),  # noqa: B008 - immutable
+    lens: Aberration | None = None,
+) -> GreyArray:
     """A phone's picture of a plate between dark and bright ground, which change its levels."""
     sensor = Sensor(tone=ToneCurve.SRGB, sharpening=0.8, sharpening_px=1.2)
     irradiance = np.full((LENS.height, LENS.width), 0.03)
     irradiance[:, LENS.width // 2 :] = 0.9
-    image_plate(LENS, TARGET_PLATE, pose, Optics(0.7)).paste(irradiance)
-    colours = Phone().photograph(sensor, irradiance, 0.8, rng)
+    image_plate(LENS, TARGET_PLATE, pose, Optics(0.7, aberration=lens)).paste(irradiance)
+    colours = phone.photograph(sensor, irradiance, 0.8, rng)
     return np.asarray(cv2.cvtColor(colours, cv2.COLOR_RGB2GRAY))
 
 
@@ -245,6 +250,24 @@ def test_a_phones_halos_are_told_from_levels(start_near: StartNear) -> None:
         sigmas.append((seen.distance_m - pose.distance_m) / seen.sd_distance_m)
     assert 0.003 < math.sqrt(np.mean(np.square(errors))) < 0.0095
     assert 0.35 < math.sqrt(np.mean(np.square(sigmas))) < 1.4
+
+
+def test_the_centre_is_uncertain_where_a_phone_hides_that_the_lens_is_skew(
+    start_near: StartNear,
+) -> None:
+    """With no more of the skew's displacement than elsewhere, z of these centres was 2.0."""
+    camera, squares = replace(LENS, response=Response.UNKNOWN), []
+    phone = Phone(bilateral=0.3)
+    for seed in range(6):
+        rng = np.random.default_rng(900 + seed)
+        pose, lens = some_pose(rng), Aberration(coma=0.2, coma_deg=rng.uniform(0.0, 360.0))
+        grey = phone_photograph(pose, rng, phone, lens)
+        start = start_near(camera, pose, rng)
+        seen = measure_by_model(grey, camera, TARGET_PLATE.target, start)
+        assert seen.uncertainty is not None
+        off_px = seen.centre_px - camera.project(pose.translation_m[None])[0]
+        squares.append(off_px @ np.linalg.solve(seen.uncertainty.centre_cov_px2, off_px))
+    assert 0.6 < math.sqrt(0.5 * np.mean(squares)) < 1.5
 
 
 @pytest.mark.parametrize(("farther", "near_sigmas"), [(1.35, 3.3), (1.47, 2.0)])

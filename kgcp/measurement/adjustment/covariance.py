@@ -60,8 +60,10 @@ _PER_SHARPENING_PX = 0.003
 _ON_SMALL_RINGS, _ON_EVEN_SMALL_RINGS = 1.8, 1.4
 # Of what a skew spread displaces: beyond its third moment nothing is known. Of 139 plates behind
 # four comatic lenses, centres are off by 0.09 to 0.20 of it per axis (RMS), behind another
-# program's lens by 0.19. Where levels vary they take part of it, and so does noise reduction.
-_SKEW_SHARE, _SKEW_SHARE_IN_UNEVEN_LIGHT = 0.18, 0.5
+# program's lens by 0.19. A bilateral filter hides skew, but leaves the displacement. Residuals then
+# agree along edges: the share grows by as much as 1 while that inflates variances by 1.25 to 2.75
+# (`benchmarks.accuracy.ring_sizes`; another program's mixture has 2.6 to 4.7).
+_SKEW_SHARE, _HIDDEN_SKEW_SHARE, _HIDES_SKEW = 0.18, 1.0, (1.25, 2.75)
 # … and of what a kurtosis displaces. Out of focus by 2 and 3 px, without it, distances of rings of
 # R < 13 px have z of 1.0 to 2.0; with 0.2 instead, larger rings have 0.5 to 0.8.
 _KURTOSIS_SHARE = 0.12
@@ -129,7 +131,7 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
     pose_cov *= unevenness_factor(fit, mean)
     if fit.parameters.has_skew:
         depth_m = fit.parameters.matrix[2, 3]
-        across_px = _skew_displacement_px(fit, mean * np.diag(inverse))
+        across_px = _skew_displacement_px(fit, mean * np.diag(inverse), mean)
         across_m = across_px * depth_m / fit.sample.problem.focal_px
         pose_cov[[0, 1], [0, 1]] += across_m * across_m
     if fit.parameters.has_kurtosis:
@@ -168,18 +170,20 @@ def _by_unknown_rotation(fit: TargetFit, shutter: RollingShutter) -> FloatArray:
     )
 
 
-def _skew_displacement_px(fit: TargetFit, variances: FloatArray) -> float:
+def _skew_displacement_px(fit: TargetFit, variances: FloatArray, inflation: float) -> float:
     """Return the standard deviation of the centre by what skew spreads displace it [px].
 
     A third cumulant κ displaces all edges across it by κ / 6σ². Higher moments of the spread are
-    not known, so that holds but for about a fifth of it, or half in uneven light. What of a κ may
-    be noise, by the `variances` of the free parameters, is in the covariance already.
+    not known, so that holds but for about a fifth of it; and where an `inflation` says that edges
+    were processed, the κ that is seen may be a part of the lens's. What of a κ may be noise, by the
+    `variances` of the free parameters, is in the covariance already.
     """
     blur = fit.parameters.blur
     skew = np.array(blur.skew)
     of_skew = variances[np.searchsorted(fit.unknowns.free, SKEW_PARAMS)]
     largest = math.sqrt(max(0.0, float(np.max(skew * skew - of_skew))))
-    share = _SKEW_SHARE if fit.level_equations is None else _SKEW_SHARE_IN_UNEVEN_LIGHT
+    hidden = float(np.interp(inflation, _HIDES_SKEW, (0.0, _HIDDEN_SKEW_SHARE)))
+    share = _SKEW_SHARE + hidden
     return share * largest / (6.0 * blur.mean_sd_px**2)
 
 
