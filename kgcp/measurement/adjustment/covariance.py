@@ -60,10 +60,13 @@ _PER_SHARPENING_PX = 0.003
 _ON_SMALL_RINGS, _ON_EVEN_SMALL_RINGS = 1.8, 1.4
 # Of what a skew spread displaces: beyond its third moment nothing is known. Of 139 plates behind
 # four comatic lenses, centres are off by 0.09 to 0.20 of it per axis (RMS), behind another
-# program's lens by 0.19. A bilateral filter hides skew, but leaves the displacement. Residuals then
-# agree along edges: the share grows by as much as 1 while that inflates variances by 1.25 to 2.75
-# (`benchmarks.accuracy.ring_sizes`; another program's mixture has 2.6 to 4.7).
-_SKEW_SHARE, _HIDDEN_SKEW_SHARE, _HIDES_SKEW = 0.18, 1.0, (1.25, 2.75)
+# program's lens by 0.19. Levels that vary take part of a skew.
+_SKEW_SHARE, _SKEW_SHARE_IN_UNEVEN_LIGHT = 0.18, 0.3
+# A bilateral filter hides a skew, but leaves its displacement. Residuals then agree along edges:
+# the share grows by as much as 1 while that inflates variances by 1.25 to 2.75. (Rings of R ≥ 26 px
+# behind comatic lenses: 1.0 without such a filter, 2.3 and 3.9 with a weak and a strong one; in
+# another program's mixture 2.6 to 4.7.)
+_HIDDEN_SKEW_SHARE, _HIDES_SKEW = 1.0, (1.25, 2.75)
 # … and of what a kurtosis displaces. Out of focus by 2 and 3 px, without it, distances of rings of
 # R < 13 px have z of 1.0 to 2.0; with 0.2 instead, larger rings have 0.5 to 0.8.
 _KURTOSIS_SHARE = 0.12
@@ -174,17 +177,17 @@ def _skew_displacement_px(fit: TargetFit, variances: FloatArray, inflation: floa
     """Return the standard deviation of the centre by what skew spreads displace it [px].
 
     A third cumulant κ displaces all edges across it by κ / 6σ². Higher moments of the spread are
-    not known, so that holds but for about a fifth of it; and where an `inflation` says that edges
-    were processed, the κ that is seen may be a part of the lens's. What of a κ may be noise, by the
-    `variances` of the free parameters, is in the covariance already.
+    not known, so that holds but for about a fifth of it, or a third in uneven light. Where an
+    `inflation` says that edges were processed, the κ that is seen may be a part of the lens's. What
+    of a κ may be noise, by the `variances` of the free parameters, is in the covariance already.
     """
     blur = fit.parameters.blur
     skew = np.array(blur.skew)
     of_skew = variances[np.searchsorted(fit.unknowns.free, SKEW_PARAMS)]
     largest = math.sqrt(max(0.0, float(np.max(skew * skew - of_skew))))
     hidden = float(np.interp(inflation, _HIDES_SKEW, (0.0, _HIDDEN_SKEW_SHARE)))
-    share = _SKEW_SHARE + hidden
-    return share * largest / (6.0 * blur.mean_sd_px**2)
+    share = _SKEW_SHARE if fit.level_equations is None else _SKEW_SHARE_IN_UNEVEN_LIGHT
+    return (share + hidden) * largest / (6.0 * blur.mean_sd_px**2)
 
 
 def _shift_by_kurtosis(fit: TargetFit, inverse: FloatArray, inflation: float) -> FloatArray:

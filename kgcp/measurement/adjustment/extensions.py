@@ -44,7 +44,12 @@ from kgcp.measurement.adjustment.spread_shape import (
     with_shape,
 )
 from kgcp.measurement.adjustment.two_poses import TwoPoses, fit_at, fit_both_poses
-from kgcp.measurement.adjustment.unknowns import unknowns_of, without_even_light
+from kgcp.measurement.adjustment.unknowns import (
+    EDGE_TONE_CHI2,
+    unknowns_of,
+    with_edge_tone,
+    without_even_light,
+)
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.image_model.photometry import (
     PARAM_COUNT,
@@ -236,7 +241,8 @@ def _best_in_any_light(
     if start is not None:
         plateaus = find_plateaus()
         if plateaus is not None and plateaus.is_uneven:
-            return _with_kurtosis(problem, _over_another_base(problem, start))
+            varying = _with_edge_tone(problem, _over_another_base(problem, start))
+            return _with_kurtosis(problem, varying)
     try:
         plain = _with_shape(problem, fit_both_poses(problem, pose, blur))
     except Rejection:
@@ -252,10 +258,11 @@ def _best_in_any_light(
         raise UnevenLightInBins
     plateaus = find_plateaus()
     if start is not None:
-        varying = _over_another_base(problem, start)
+        varying = _with_edge_tone(problem, _over_another_base(problem, start))
     elif plateaus is None or not plateaus.is_uneven:
         # the one tone parameter of bins holds only for the levels that it was fitted with
-        varying = _with_levels(problem, plain, None if problem.tone is Tone.OF_BINS else plateaus)
+        seen = None if problem.tone is Tone.OF_BINS else plateaus
+        varying = _with_edge_tone(problem, _with_levels(problem, plain, seen))
     else:
         varying = _in_seen_light(problem, pose, blur, plateaus)
     return plain if _may_be_even(plain.best, varying.best) else varying
@@ -274,7 +281,8 @@ def _may_be_even(plain: TargetFit, varying: TargetFit) -> bool:
 def _in_seen_light(problem: FitProblem, pose: Pose, blur: Blur, plateaus: Plateaus) -> TwoPoses:
     """Adjust both poses with levels that vary from those that are seen on ink and plate."""
     poses = fit_both_poses(evened_window(problem, plateaus), pose, blur)
-    return _with_kurtosis(problem, _with_shape(problem, _with_levels(problem, poses, plateaus)))
+    varying = _with_shape(problem, _with_levels(problem, poses, plateaus))
+    return _with_kurtosis(problem, _with_edge_tone(problem, varying))
 
 
 def _over_another_base(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
@@ -320,15 +328,37 @@ def _with_shape(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
     return likelier
 
 
+def _with_edge_tone(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
+    """Let edges have a tone of their own beside levels that vary, if they must.
+
+    Then kurtosis may be asked for, which levels and the tone curve hid.
+    """
+    best = poses.best
+    if best.level_equations is None or not problem.tone.is_unknown or best.parameters.has_edge_tone:
+        return poses
+    unknowns = with_edge_tone(best.unknowns)
+    toned = _if_asked_for(problem, poses, unknowns, Param.EDGE_TONE, EDGE_TONE_CHI2)
+    return poses if toned is poses else _with_kurtosis(problem, toned)
+
+
 def _with_kurtosis(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
     """Let the kurtosis of the point spread be free beside levels that vary, if it must be."""
-    best, other = poses.best, poses.other
+    best = poses.best
     if best.level_equations is None or best.parameters.has_kurtosis:
         return poses
     unknowns = with_shape(best.unknowns, [int(Param.KURTOSIS)])
+    return _if_asked_for(problem, poses, unknowns, Param.KURTOSIS, KURTOSIS_CHI2_WITH_LEVELS)
+
+
+def _if_asked_for(
+    problem: FitProblem, poses: TwoPoses, unknowns: Unknowns, param: Param, least_chi2: float
+) -> TwoPoses:
+    """Fit with one more parameter if residuals ask for it by a χ²."""
     with contextlib.suppress(Rejection):  # then it is better without
-        if chi2_with_levels(best, unknowns, Param.KURTOSIS) > KURTOSIS_CHI2_WITH_LEVELS:
-            return _fit_shaped(problem, best.parameters, other.parameters.pose, unknowns)
+        if chi2_with_levels(poses.best, unknowns, param) > least_chi2:
+            return _fit_shaped(
+                problem, poses.best.parameters, poses.other.parameters.pose, unknowns
+            )
     return poses
 
 

@@ -25,7 +25,7 @@ class Unknowns:
     """Which parameters are estimated, and what is known of them beforehand."""
 
     free: IndexArray  # (p,): estimated parameters, by `Param`
-    # (26,): independent normal priors on the nuisance parameters; precision 0: none
+    # (27,): independent normal priors on the nuisance parameters; precision 0: none
     mean: FloatArray
     precision: FloatArray
     free_precision: FloatArray  # (p,): of the estimated parameters
@@ -40,7 +40,7 @@ class Unknowns:
         return _penalty(parameters.vector, self.mean, self.precision)
 
     def step_of(self, solution: FloatArray) -> FloatArray:
-        """Return the step (26,) by all parameters, of that by the estimated ones (p,)."""
+        """Return the step (27,) by all parameters, of that by the estimated ones (p,)."""
         step = np.zeros(PARAM_COUNT)
         step[self.free] = solution
         return step

@@ -20,8 +20,9 @@ _MIN_VARIANCE_PX2 = 0.075  # a pixel alone spreads by 1/12 px²
 _MAX_ANISOTROPY = 0.95
 _MEAN, _DIFFERENCE, _XY = int(Param.BLUR_MEAN), int(Param.BLUR_DIFFERENCE), int(Param.BLUR_XY)
 
-_OF_BLUR, _OF_LIGHT = slice(_MEAN, int(Param.BLACK)), slice(int(Param.BLACK), int(Param.SKEW_XXX))
-_OF_SHAPE = slice(int(Param.SKEW_XXX), None)
+_OF_BLUR = slice(_MEAN, int(Param.BLACK))
+_OF_LIGHT = np.array([*range(Param.BLACK, Param.SKEW_XXX), Param.EDGE_TONE])
+_OF_SHAPE = slice(int(Param.SKEW_XXX), int(Param.EDGE_TONE))
 _OF_SKEW = slice(int(Param.SKEW_XXX), int(Param.KURTOSIS))
 
 
@@ -30,7 +31,7 @@ class Parameters:
     """A pose, a blur and a light, as the numbers that the adjustment works with."""
 
     matrix: FloatArray  # (3, 4): of the pose: rotation and translation [m], target → camera
-    vector: FloatArray  # (26,): all others in the order of `Param`, with zeros for the pose
+    vector: FloatArray  # (27,): all others in the order of `Param`, with zeros for the pose
     field: LightField | None = None  # of light that is not the same everywhere
 
     @staticmethod
@@ -38,8 +39,9 @@ class Parameters:
         """Collect the numbers."""
         mean, difference = 0.5 * (blur.xx + blur.yy), 0.5 * (blur.xx - blur.yy)
         of_blur = (mean, difference, blur.xy, blur.streak_x, blur.streak_y)
-        of_shape = (*blur.skew, blur.kurtosis)
-        return Parameters(pose.matrix, np.array((*_NO_POSE, *of_blur, *light.values, *of_shape)))
+        *of_light, edge_tone = light.values
+        numbers = (*_NO_POSE, *of_blur, *of_light, *blur.skew, blur.kurtosis, edge_tone)
+        return Parameters(pose.matrix, np.array(numbers))
 
     @cached_property
     def pose(self) -> Pose:
@@ -69,12 +71,17 @@ class Parameters:
         """Whether the point spread is more or less peaked than a Gaussian."""
         return bool(self.vector[Param.KURTOSIS])
 
+    @property
+    def has_edge_tone(self) -> bool:
+        """Whether edges have a tone of their own."""
+        return bool(self.vector[Param.EDGE_TONE])
+
     def at(self, pose: Pose) -> Parameters:
         """Return the same blur and light at another pose."""
         return Parameters(pose.matrix, self.vector, self.field)
 
     def moved(self, step: FloatArray) -> Parameters:
-        """Return the parameters after a step (26,) in the order of `Param`.
+        """Return the parameters after a step (27,) in the order of `Param`.
 
         That of the pose is a translation [m] and a left rotation vector [rad].
         """

@@ -28,7 +28,7 @@ from kgcp.measurement.image_model.blurred_plate import (
 )
 from kgcp.measurement.image_model.edge_terms import skew_rows, spread_share_gradient
 from kgcp.measurement.image_model.noise import GreyNoise, Misfit, estimate_noise, misfit
-from kgcp.measurement.image_model.photometry import SHAPE_PARAMS, Param
+from kgcp.measurement.image_model.photometry import SHAPE_PARAMS
 
 EquationsOf = Callable[[Parameters, FloatArray, Misfit], Equations]
 
@@ -128,7 +128,7 @@ def _with_edge_terms(
     covariance = parameters.blur.total_covariance
     if parameters.has_skew or parameters.has_kurtosis:
         rows = _shape_rows(share, sample, parameters)
-        value = value + parameters.vector[Param.SKEW_XXX :] @ rows
+        value = value + parameters.vector[SHAPE_PARAMS] @ rows
         jacobian = np.vstack((jacobian, rows)) if len(jacobian) else jacobian
     if field is None:
         return WhiteShare(share.views, value, jacobian), None

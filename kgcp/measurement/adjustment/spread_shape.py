@@ -99,7 +99,7 @@ def _by_shape(fit: TargetFit) -> FloatArray:
 
 def with_shape(unknowns: Unknowns, shape: list[int]) -> Unknowns:
     """Return the unknowns with some parameters of the point spread's shape among them."""
-    free = np.append(unknowns.free, shape)
+    free = np.sort(np.append(unknowns.free, shape))
     precision = unknowns.precision.copy()
     precision[SHAPE_PARAMS] = SHAPE_PRECISIONS
     return Unknowns(free, unknowns.mean, precision, precision[free])

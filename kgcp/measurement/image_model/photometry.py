@@ -91,10 +91,11 @@ class Param(IntEnum):
     SKEW_XYY = 23
     SKEW_YYY = 24
     KURTOSIS = 25
+    EDGE_TONE = 26
 
 
-PARAM_COUNT = 26
-PLAIN_COUNT = 21  # without the shape of the point spread
+PARAM_COUNT = 27
+PLAIN_COUNT = 21  # without the shape of the point spread and the tone of edges
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,13 +117,16 @@ class Light:
     # strength of the unsharp mask after the tone curve, and of the one before it
     sharpening: float = 0.0
     linear_sharpening: float = 0.0
+    # by which the white share is raised at edges, as far as processing follows the local contrast:
+    # of share · (1 − share). Only beside levels that vary; otherwise the tone curve does the same.
+    edge_tone: float = 0.0
 
     @property
     def values(self) -> tuple[float, ...]:
-        """All ten, in the order of `Param`."""
+        """All eleven, in the order of `Param`."""
         levels = (self.black, self.white, self.slope_x, self.slope_y, self.curvature)
         tone = (self.tone_1, self.tone_2, self.tone_3)
-        return (*levels, *tone, self.sharpening, self.linear_sharpening)
+        return (*levels, *tone, self.sharpening, self.linear_sharpening, self.edge_tone)
 
 
 def plateau_levels(light: Light, tone: Tone) -> tuple[float, float]:
@@ -163,7 +167,7 @@ _TONE_ROWS = [Param.TONE_1, Param.TONE_2, Param.TONE_3]
 _LEVEL_ROWS = [Param.BLACK, Param.WHITE, *_TONE_ROWS]
 SKEW_PARAMS = [int(Param.SKEW_XXX), int(Param.SKEW_XXY), int(Param.SKEW_XYY), int(Param.SKEW_YYY)]
 SHAPE_PARAMS = [*SKEW_PARAMS, int(Param.KURTOSIS)]  # what makes a point spread no Gaussian
-_RARE_ROWS = np.array([Param.STREAK_X, Param.STREAK_Y, *SHAPE_PARAMS])
+_RARE_ROWS = np.array([Param.STREAK_X, Param.STREAK_Y, *SHAPE_PARAMS, Param.EDGE_TONE])
 _SHARE_STEPS = 400
 _CURVE_STEPS = 64  # between ink and plate
 GEOMETRY_ROWS = 11  # of pose and blur, without the shape of the point spread
@@ -216,8 +220,11 @@ class PhotometricModel:
         _expose(share, self.offsets, values, self._added(added), value)
         lit, curved = _light_at(self.offsets, values)
         ink, between = (0.0, 1.0) if added is None else (added[0], 1.0 + added[1] - added[0])
-        x = lit * (ink + between * share) + (lit - 1.0) * light.black / (light.white - light.black)
-        carried: FloatArray = curved * lit * between * _slopes_of_toned(x, values)[-1] * rows
+        bent = share + light.edge_tone * share * (1.0 - share)
+        by_share = 1.0 + light.edge_tone * (1.0 - 2.0 * share)
+        x = lit * (ink + between * bent) + (lit - 1.0) * light.black / (light.white - light.black)
+        slope = _slopes_of_toned(x, values)[-1] * by_share
+        carried: FloatArray = curved * lit * between * slope * rows
         mask = self._mask_in_light(added)
         if mask is not None and light.linear_sharpening:
             value += light.linear_sharpening * mask.detail(value, light.black, light.white)
@@ -277,8 +284,8 @@ class PhotometricModel:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the grey values (n,) and their Jacobian; `added` as in `levels`.
 
-        It has 21 rows, or 26 where the point spread is skew or has a kurtosis. Where the light is
-        uneven it has 28, the last two by what is added to ink and to plate.
+        It has 21 rows, or 27 where the point spread is skew or has a kurtosis. Where the light is
+        uneven it has 29, the last two by what is added to ink and to plate.
         """
         value = np.empty(len(share.value))
         has_shape = len(share.jacobian) > GEOMETRY_ROWS
@@ -386,16 +393,23 @@ def _toned(
     return tone + slope * beyond, slope, by_1, by_2, by_3
 
 
+@inlined
+def _bent(share: float, edge_tone: float) -> tuple[float, float]:
+    """Return the white share as processing at edges makes it, and its slope."""
+    return share + edge_tone * share * (1.0 - share), 1.0 + edge_tone * (1.0 - 2.0 * share)
+
+
 @compiled
 def _share_at(level: float, light: tuple[float, ...]) -> float:
     """Return where between ink and plate a level is first passed for good, by steps of 1/400."""
-    black, white, _, _, _, tone_1, tone_2, tone_3, _, _ = light
+    black, white, _, _, _, tone_1, tone_2, tone_3, _, _, edge_tone = light
     highest = black
     if level < highest:
         return 0.0
     for k in range(1, _SHARE_STEPS + 1):
         t = k / _SHARE_STEPS
-        tone, _, _, _, _ = _toned(t, tone_1, tone_2, tone_3)
+        bent, _ = _bent(t, edge_tone)
+        tone, _, _, _, _ = _toned(bent, tone_1, tone_2, tone_3)
         grey = black + (white - black) * tone
         if grey > level:
             return (k - 1 + (level - highest) / (grey - highest)) / _SHARE_STEPS
@@ -508,12 +522,13 @@ def _expose(
     value: FloatArray,
 ) -> None:
     """Fill in black + (white − black) · tone(x), with x as in the module's description."""
-    black, white, _, _, _, tone_1, tone_2, tone_3, _, _ = light
+    black, white, _, _, _, tone_1, tone_2, tone_3, _, _, edge_tone = light
     each = 1 if added.shape[1] > 1 else 0
     for i in range(len(share)):
         ink, plate = added[0, each * i], 1.0 + added[1, each * i]
         lit, curved, _ = _lit(offsets[0, i], offsets[1, i], light)
-        x = lit * (ink + (plate - ink) * share[i]) + (lit - 1.0) * black / (white - black)
+        bent, _ = _bent(share[i], edge_tone)
+        x = lit * (ink + (plate - ink) * bent) + (lit - 1.0) * black / (white - black)
         tone, _, _, _, _ = _toned(x, tone_1, tone_2, tone_3)
         value[i] = curved * (black + (white - black) * tone)
 
@@ -529,25 +544,26 @@ def _expose_with_slopes(
     value: FloatArray,
     jacobian: FloatArray,
 ) -> None:
-    """Extend `_expose` by derivatives: by geometry (11 or 16, n), then in the order of `Param`.
+    """Extend `_expose` by derivatives: by geometry (11 or 16, n), and in the order of `Param`.
 
     Where the light is uneven, those by what is added to ink and to plate follow.
     """
-    black, white, _, _, _, tone_1, tone_2, tone_3, _, _ = light
+    black, white, _, _, _, tone_1, tone_2, tone_3, _, _, edge_tone = light
     contrast, gains = white - black, np.empty(len(share))
     has_shape = by_geometry.shape[0] > 11
     each = 1 if added.shape[1] > 1 else 0
     for i in range(len(share)):
         ink, plate = added[0, each * i], 1.0 + added[1, each * i]
         lit, curved, bulge = _lit(offsets[0, i], offsets[1, i], light)
-        x = ink + (plate - ink) * share[i]
+        bent, by_share = _bent(share[i], edge_tone)
+        x = ink + (plate - ink) * bent
         tone, slope, by_1, by_2, by_3 = _toned(
             lit * x + (lit - 1.0) * black / contrast, tone_1, tone_2, tone_3
         )
         core = black + contrast * tone
         value[i] = curved * core
         gain = curved * contrast * lit
-        gains[i] = gain * slope * (plate - ink)
+        gains[i] = gain * slope * (plate - ink) * by_share
         of_ink_light = slope * (lit - 1.0) / contrast  # by black / contrast, which is part of x
         jacobian[11, i] = curved * (1.0 - tone + of_ink_light * white)
         jacobian[12, i] = curved * (tone - of_ink_light * black)
@@ -557,9 +573,11 @@ def _expose_with_slopes(
         jacobian[15, i] = core * bulge
         jacobian[16, i], jacobian[17, i], jacobian[18, i] = bend * by_1, bend * by_2, bend * by_3
         jacobian[19, i] = jacobian[20, i] = 0.0
+        if len(jacobian) > 26:
+            jacobian[26, i] = gain * slope * (plate - ink) * share[i] * (1.0 - share[i])
         if each:
-            jacobian[26, i] = gain * slope * (1.0 - share[i])
-            jacobian[27, i] = gain * slope * share[i]
+            jacobian[27, i] = gain * slope * (1.0 - bent)
+            jacobian[28, i] = gain * slope * bent
     for k in range(21, min(26, len(jacobian))):
         for i in range(len(share)):
             jacobian[k, i] = gains[i] * by_geometry[k - 10, i] if has_shape else 0.0

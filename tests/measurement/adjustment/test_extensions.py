@@ -11,6 +11,7 @@ import pytest
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment import extensions, random_levels
+from kgcp.measurement.adjustment.normal_equations import Unknowns
 from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.random_levels import needs_varying_levels
@@ -196,6 +197,7 @@ def test_small_rings_are_in_even_light_where_levels_explain_little_more(
     monkeypatch.setattr(extensions, "_with_shape", lambda _, poses: poses)
     monkeypatch.setattr(extensions, "needs_varying_levels", lambda _: True)
     monkeypatch.setattr(extensions, "_with_levels", lambda *_: varying)
+    monkeypatch.setattr(extensions, "_with_edge_tone", lambda _, poses: poses)
     monkeypatch.setattr(extensions, "advantage_over", lambda *_: advantage)
     pose = Pose(np.eye(3), np.array([0.0, 0.0, 9.0]))
     chosen = extensions._best_in_any_light(problem, pose, Blur(0.5, 0.5, 0.0), lambda: None, None)
@@ -220,6 +222,7 @@ def test_bins_in_nearly_even_light_keep_the_levels_that_they_were_fitted_with(
     monkeypatch.setattr(extensions, "_with_shape", lambda _, poses: poses)
     monkeypatch.setattr(extensions, "needs_varying_levels", lambda _: True)
     monkeypatch.setattr(extensions, "_with_levels", with_levels)
+    monkeypatch.setattr(extensions, "_with_edge_tone", lambda _, poses: poses)
     monkeypatch.setattr(extensions, "_may_be_even", lambda *_: True)
     pose = Pose(np.eye(3), np.array([0.0, 0.0, 9.0]))
     extensions._best_in_any_light(problem, pose, Blur(0.5, 0.5, 0.0), lambda: seen, None)
@@ -265,6 +268,7 @@ def test_levels_over_a_second_base_start_from_those_over_the_first(
     monkeypatch.setattr(extensions, "_in_seen_light", fit_evened)
     monkeypatch.setattr(extensions, "_over_another_base", fit_over_another)
     monkeypatch.setattr(extensions, "_with_shape", lambda _, poses: poses)
+    monkeypatch.setattr(extensions, "_with_edge_tone", lambda _, poses: poses)
     monkeypatch.setattr(extensions, "_with_kurtosis", lambda _, poses: poses)
     monkeypatch.setattr(extensions, "needs_varying_levels", lambda _: True)
     monkeypatch.setattr(extensions, "fit_other_pose", lambda best, _: (best, None))
@@ -274,6 +278,45 @@ def test_levels_over_a_second_base_start_from_those_over_the_first(
     )
     assert fits == fitted_from
     assert poses.best is varying.best
+
+
+@pytest.mark.parametrize(
+    ("tone", "asks", "freed"),
+    [
+        (Tone.UNKNOWN, {}, []),
+        (Tone.UNKNOWN, {Param.EDGE_TONE: 101.0, Param.KURTOSIS: 39.0}, [Param.EDGE_TONE]),
+        (Tone.UNKNOWN, {Param.EDGE_TONE: 99.0, Param.KURTOSIS: 41.0}, []),
+        (
+            Tone.UNKNOWN_FROM_LINE,
+            {Param.EDGE_TONE: 101.0, Param.KURTOSIS: 41.0},
+            [Param.EDGE_TONE, Param.KURTOSIS],
+        ),
+        (Tone.LINEAR, {Param.EDGE_TONE: 101.0}, []),  # nothing is processed
+    ],
+)
+def test_edges_have_a_tone_of_their_own_beside_levels_if_residuals_ask_for_it(
+    monkeypatch: pytest.MonkeyPatch, tone: Tone, asks: dict[Param, float], freed: list[Param]
+) -> None:
+    free = np.array([0, 1, 2, int(Param.SKEW_YYY)])
+    start = Unknowns(free, np.zeros(PARAM_COUNT), np.ones(PARAM_COUNT), np.ones(4))
+
+    def fitted(unknowns: Unknowns) -> object:
+        vector = np.zeros(PARAM_COUNT)
+        vector[unknowns.free] = 0.5
+        has = {"has_edge_tone": Param.EDGE_TONE, "has_kurtosis": Param.KURTOSIS}
+        parameters = stand_in(pose=None, **{name: bool(vector[of]) for name, of in has.items()})
+        best = stand_in(level_equations=object(), parameters=parameters, unknowns=unknowns)
+        return stand_in(best=best, other=stand_in(parameters=parameters))
+
+    monkeypatch.setattr(
+        extensions, "chi2_with_levels", lambda _, __, param: asks.get(Param(param), 0.0)
+    )
+    monkeypatch.setattr(extensions, "_fit_shaped", lambda _, __, ___, unknowns: fitted(unknowns))
+    poses = extensions._with_edge_tone(stand_in(tone=tone), fitted(start))
+    found = poses.best.unknowns
+    assert set(found.free) == {*free, *freed}
+    assert np.all(np.diff(found.free) > 0)
+    np.testing.assert_array_equal(found.free_precision, found.precision[found.free])
 
 
 STEP, STRIP = [0.9, 4.0, 0.8], [[2.5, 8.0, 0.3], [2.5, 16.0, 0.3]]
