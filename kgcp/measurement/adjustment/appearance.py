@@ -16,6 +16,7 @@ from kgcp.measurement.image_model.photometry import (
     encoded,
     plateau_levels,
     share_at,
+    share_before_edge_tone,
     toned,
 )
 from kgcp.measurement.image_model.window import contour_px, semi_major_axis_px
@@ -82,7 +83,8 @@ def places_across_edges_px(fit: TargetFit, level: float | None) -> FloatArray:
         dark, bright = (np.interp(side, lights, rising) for side in (ink, plate))
         midway = 0.5 * (dark + np.minimum(bright, high))
         reached = np.interp(midway if level is None else level, rising, lights)
-        shares = (reached - ink) / np.maximum(plate - ink, _LEAST_CONTRAST)
+        bent = (reached - ink) / np.maximum(plate - ink, _LEAST_CONTRAST)
+        shares = share_before_edge_tone(np.clip(bent, 0.0, 1.0), light)
     shares = np.clip(shares, _LEAST_SHARE, 1.0 - _LEAST_SHARE)
     return np.asarray(fit.parameters.blur.mean_sd_px * ndtri(shares))
 

@@ -63,10 +63,10 @@ _ON_SMALL_RINGS, _ON_EVEN_SMALL_RINGS = 1.8, 1.4
 # program's lens by 0.19. Levels that vary take part of a skew.
 _SKEW_SHARE, _SKEW_SHARE_IN_UNEVEN_LIGHT = 0.18, 0.3
 # A bilateral filter hides a skew, but leaves its displacement. Residuals then agree along edges:
-# the share grows by as much as 1 while that inflates variances by 1.25 to 2.75. (Rings of R ≥ 26 px
-# behind comatic lenses: 1.0 without such a filter, 2.3 and 3.9 with a weak and a strong one; in
+# the share grows by as much as 1.1 while that inflates variances by 1.25 to 2.75. (Rings of R ≥ 26
+# px behind comatic lenses: 1.0 without such a filter, 2.3 and 3.9 with a weak and a strong one; in
 # another program's mixture 2.6 to 4.7.)
-_HIDDEN_SKEW_SHARE, _HIDES_SKEW = 1.0, (1.25, 2.75)
+_HIDDEN_SKEW_SHARE, _HIDES_SKEW = 1.1, (1.25, 2.75)
 # … and of what a kurtosis displaces. Out of focus by 2 and 3 px, without it, distances of rings of
 # R < 13 px have z of 1.0 to 2.0; with 0.2 instead, larger rings have 0.5 to 0.8.
 _KURTOSIS_SHARE = 0.12

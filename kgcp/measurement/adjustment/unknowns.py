@@ -35,9 +35,9 @@ _STATED_TONE_SD = 0.02  # of the three shapes of a stated curve; 0.06 and 0.2 ar
 EDGE_TONE_CHI2 = 100.0
 """χ² from which on edges have a tone of their own beside levels that vary.
 
-Over the right base of the tone curve, 29 rings under another program's shadows and in its dirt have
-31 at most, but for one of 114; 33 of 48 rings of R ≥ 37 px behind a bilateral filter have 200 and
-more. With 0, wrong bases of the curve would use it as well, and fits under highlights drift.
+Over the base of the tone curve that asks for it less, 29 rings under another program's shadows and
+in its dirt have 20 at most. Of 24 rings in dirt behind a bilateral filter (R ≥ 37 px), 41 of 48
+fits over both bases have 200 and more. Wrong bases of the curve ask for it, too, less than that.
 """
 _EDGE_TONE_SD = 0.15  # with 0.5, rings in dirt and under highlights have twice the errors
 # Of burnt plates of unknown tone: without a prior, white and tone would drift together.

@@ -7,7 +7,8 @@ gradient is lit = 1 + slope · offset; local tone mapping leaves curved = 1 + cu
 x that has three parameters; sharpening is an unsharp mask on the pixel grid, after the tone curve
 as in cameras. Demosaicing sharpens, too, and before the tone curve: behind it, that shows most on
 the dark side of edges. Together they are what displaces apparent edges: δ is a consequence here,
-not a parameter.
+not a parameter. In uneven light, processing may bend edges alone: in place of the share, x then has
+share + edge_tone · share · (1 − share).
 """
 
 from __future__ import annotations
@@ -369,8 +370,15 @@ class PhotometricModel:
         )
 
 
+def share_before_edge_tone(bent: FloatArray, light: Light) -> FloatArray:
+    """Return the white share (n,), of what the tone of edges makes of it."""
+    twice = 1.0 + light.edge_tone
+    root = np.sqrt(np.maximum(twice * twice - 4.0 * light.edge_tone * bent, 0.0))
+    return np.asarray(2.0 * bent / (twice + root))
+
+
 def share_at(level: float, light: Light, tone: Tone) -> float:
-    """Return the white share at which a grey value is reached, 0…1; without a gradient of light."""
+    """Return the white share at which a grey value is reached, 0…1, in light that is even."""
     return _share_at(float(decoded(np.array(level), tone)), light.values)
 
 
@@ -402,14 +410,13 @@ def _bent(share: float, edge_tone: float) -> tuple[float, float]:
 @compiled
 def _share_at(level: float, light: tuple[float, ...]) -> float:
     """Return where between ink and plate a level is first passed for good, by steps of 1/400."""
-    black, white, _, _, _, tone_1, tone_2, tone_3, _, _, edge_tone = light
+    black, white, _, _, _, tone_1, tone_2, tone_3, _, _, _ = light
     highest = black
     if level < highest:
         return 0.0
     for k in range(1, _SHARE_STEPS + 1):
         t = k / _SHARE_STEPS
-        bent, _ = _bent(t, edge_tone)
-        tone, _, _, _, _ = _toned(bent, tone_1, tone_2, tone_3)
+        tone, _, _, _, _ = _toned(t, tone_1, tone_2, tone_3)
         grey = black + (white - black) * tone
         if grey > level:
             return (k - 1 + (level - highest) / (grey - highest)) / _SHARE_STEPS

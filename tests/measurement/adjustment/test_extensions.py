@@ -281,31 +281,43 @@ def test_levels_over_a_second_base_start_from_those_over_the_first(
 
 
 @pytest.mark.parametrize(
-    ("tone", "asks", "freed"),
+    ("tone", "clipped", "asks", "freed"),
     [
-        (Tone.UNKNOWN, {}, []),
-        (Tone.UNKNOWN, {Param.EDGE_TONE: 101.0, Param.KURTOSIS: 39.0}, [Param.EDGE_TONE]),
-        (Tone.UNKNOWN, {Param.EDGE_TONE: 99.0, Param.KURTOSIS: 41.0}, []),
+        (Tone.UNKNOWN, 2, {}, []),
+        (Tone.UNKNOWN, 2, {Param.EDGE_TONE: 101.0, Param.KURTOSIS: 39.0}, [Param.EDGE_TONE]),
+        (Tone.UNKNOWN, 2, {Param.EDGE_TONE: 99.0, Param.KURTOSIS: 41.0}, []),
         (
             Tone.UNKNOWN_FROM_LINE,
+            2,
             {Param.EDGE_TONE: 101.0, Param.KURTOSIS: 41.0},
             [Param.EDGE_TONE, Param.KURTOSIS],
         ),
-        (Tone.LINEAR, {Param.EDGE_TONE: 101.0}, []),  # nothing is processed
+        (Tone.UNKNOWN, 3, {Param.EDGE_TONE: 101.0}, []),  # burnt
+        (Tone.LINEAR, 2, {Param.EDGE_TONE: 101.0}, []),  # nothing is processed
     ],
 )
 def test_edges_have_a_tone_of_their_own_beside_levels_if_residuals_ask_for_it(
-    monkeypatch: pytest.MonkeyPatch, tone: Tone, asks: dict[Param, float], freed: list[Param]
+    monkeypatch: pytest.MonkeyPatch,
+    tone: Tone,
+    clipped: int,
+    asks: dict[Param, float],
+    freed: list[Param],
 ) -> None:
     free = np.array([0, 1, 2, int(Param.SKEW_YYY)])
     start = Unknowns(free, np.zeros(PARAM_COUNT), np.ones(PARAM_COUNT), np.ones(4))
 
-    def fitted(unknowns: Unknowns) -> object:
+    def fitted(unknowns: Unknowns) -> Any:  # noqa: ANN401 - stands for two poses
         vector = np.zeros(PARAM_COUNT)
         vector[unknowns.free] = 0.5
         has = {"has_edge_tone": Param.EDGE_TONE, "has_kurtosis": Param.KURTOSIS}
-        parameters = stand_in(pose=None, **{name: bool(vector[of]) for name, of in has.items()})
-        best = stand_in(level_equations=object(), parameters=parameters, unknowns=unknowns)
+        has_it = {name: bool(vector[of]) for name, of in has.items()}
+        parameters = stand_in(pose=None, **has_it)
+        best = stand_in(
+            level_equations=object(),
+            parameters=parameters,
+            unknowns=unknowns,
+            sample=stand_in(censoring=stand_in(is_clipped=np.arange(100) < clipped)),
+        )
         return stand_in(best=best, other=stand_in(parameters=parameters))
 
     monkeypatch.setattr(

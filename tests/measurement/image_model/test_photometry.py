@@ -28,6 +28,7 @@ from kgcp.measurement.image_model.photometry import (
     light_after_step,
     light_over,
     plateau_levels,
+    share_before_edge_tone,
     toned,
     toned_between,
 )
@@ -163,6 +164,19 @@ def test_rows_of_the_jacobian_are_derivatives_in_uneven_light(tone: Tone) -> Non
         )
         expected = (high - low) / (2.0 * STEP)
         np.testing.assert_allclose(jacobian[PARAM_COUNT + k], expected, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("edge_tone", [-0.6, 0.0, 0.9])
+def test_edges_are_as_if_the_white_share_was_bent(edge_tone: float) -> None:
+    photometry = make_imager(Tone.UNKNOWN, 0.0)
+    light = replace(LIGHT, linear_sharpening=0.0)
+    share = make_share(photometry).value
+    bent = share + edge_tone * share * (1.0 - share)
+    added = np.full((2, len(share)), 0.05)
+    toned = photometry.levels(share, replace(light, edge_tone=edge_tone), added)
+    np.testing.assert_allclose(toned, photometry.levels(bent, light, added), atol=1e-14)
+    back = share_before_edge_tone(bent, replace(light, edge_tone=edge_tone))
+    np.testing.assert_allclose(back, share, atol=1e-12)
 
 
 @pytest.mark.parametrize("tone", [Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE])
