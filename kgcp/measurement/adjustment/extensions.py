@@ -78,8 +78,9 @@ _CURVE = [Param.TONE_1, Param.TONE_2, Param.TONE_3]
 # levels explained better, four gained 9 to 19, and their errors grew from 0.04 to 0.06 %. Of 200
 # fits in uneven light, six gained less than 25; none was more than 2.3 σ off in even light.
 _LEAST_ADVANTAGE_IN_SMALL_RING = 25.0
-# Share of a fit's pixels from which on too much is clipped for edges to tell two curves. With the tone
-# of edges free, 40 burnt plates half in shade have z of 2.0 and 1.7 by two phones; without, 1.6, 1.4.
+# Share of a fit's pixels from which on too much is clipped for edges to tell two curves. With the
+# tone of edges free, 40 burnt plates half in shade have z of 2.0 and 1.7 by two phones; without it,
+# 1.6 and 1.4.
 _SOME_CLIPPED = 0.02
 _MOST_BURNT = 3.0  # brightest white that is started from, of what is seen of it
 
