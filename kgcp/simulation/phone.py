@@ -5,11 +5,10 @@ reduction; a gain that follows the surroundings' brightness. Tone curve and shar
 the `Sensor`.
 
 Demosaicing is by Malvar, He & Cutler (ICASSP 2004, High-quality linear interpolation), or by the
-mean of the nearest pixels of a colour, whose blur depends on an edge's direction.
-All these filters are symmetric and so move no edge. Noise reduction is the guided filter of He, Sun
-& Tang (PAMI 35, 2013), with smoother colours, or the bilateral filter of Tomasi & Manduchi (ICCV
-1998). The latter makes edges steeper about their middle: of a skew edge, the middle is not where a
-symmetric edge would have it.
+mean of the nearest pixels of a colour, whose blur depends on an edge's direction. All these filters
+are symmetric and so move no edge. Noise reduction is the guided filter of He, Sun & Tang (PAMI 35,
+2013), with smoother colours, or the bilateral filter of Tomasi & Manduchi (ICCV 1998). The latter
+makes edges steeper about their middle, which is displaced if they are skew.
 """
 
 from __future__ import annotations

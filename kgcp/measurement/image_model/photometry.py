@@ -224,8 +224,8 @@ class PhotometricModel:
         bent = share + light.edge_tone * share * (1.0 - share)
         by_share = 1.0 + light.edge_tone * (1.0 - 2.0 * share)
         x = lit * (ink + between * bent) + (lit - 1.0) * light.black / (light.white - light.black)
-        slope = _slopes_of_toned(x, values)[-1] * by_share
-        carried: FloatArray = curved * lit * between * slope * rows
+        by_light = _slopes_of_toned(x, values)[-1]
+        carried: FloatArray = curved * lit * between * by_light * by_share * rows
         mask = self._mask_in_light(added)
         if mask is not None and light.linear_sharpening:
             value += light.linear_sharpening * mask.detail(value, light.black, light.white)
@@ -372,9 +372,9 @@ class PhotometricModel:
 
 def share_before_edge_tone(bent: FloatArray, light: Light) -> FloatArray:
     """Return the white share (n,), of what the tone of edges makes of it."""
-    twice = 1.0 + light.edge_tone
-    root = np.sqrt(np.maximum(twice * twice - 4.0 * light.edge_tone * bent, 0.0))
-    return np.asarray(2.0 * bent / (twice + root))
+    at_ink = 1.0 + light.edge_tone  # slope of the share that is bent
+    root = np.sqrt(np.maximum(at_ink * at_ink - 4.0 * light.edge_tone * bent, 0.0))
+    return np.asarray(2.0 * bent / (at_ink + root))
 
 
 def share_at(level: float, light: Light, tone: Tone) -> float:
@@ -581,8 +581,9 @@ def _expose_with_slopes(
         jacobian[16, i], jacobian[17, i], jacobian[18, i] = bend * by_1, bend * by_2, bend * by_3
         jacobian[19, i] = jacobian[20, i] = 0.0
         if len(jacobian) > 26:
-            jacobian[26, i] = gain * slope * (plate - ink) * share[i] * (1.0 - share[i])
+            jacobian[26, i] = 0.0
         if each:
+            jacobian[26, i] = gain * slope * (plate - ink) * share[i] * (1.0 - share[i])
             jacobian[27, i] = gain * slope * (1.0 - bent)
             jacobian[28, i] = gain * slope * bent
     for k in range(21, min(26, len(jacobian))):
