@@ -56,8 +56,19 @@ def fail(item: int) -> int:
     raise LookupError(str(item))
 
 
+def fail_by_setting(_: int) -> int:
+    raise SettingError("fx", "is 0", "give more")
+
+
+class OddError(Exception):
+    """An error that pickle cannot make again."""
+
+    def __init__(self, one: str, two: str) -> None:
+        super().__init__(f"{one} and {two}")
+
+
 def fail_oddly(_: int) -> int:
-    raise SettingError("fx", "is 0", "give more")  # which pickle cannot make again
+    raise OddError("this", "that")
 
 
 def pid_and(*values: object) -> tuple[int, tuple[object, ...]]:
@@ -118,7 +129,12 @@ def test_what_an_item_raises_arrives() -> None:
             list(resilient_map(fail, (4,), executor, jobs))
     with (
         pool(1) as executor,
-        pytest.raises(RuntimeError, match="SettingError: fx: is 0; give more"),
+        pytest.raises(SettingError, match=r"^fx: is 0; give more"),
+    ):
+        list(resilient_map(fail_by_setting, (4,), executor, 1))
+    with (
+        pool(1) as executor,
+        pytest.raises(RuntimeError, match="OddError: this and that"),
     ):
         list(resilient_map(fail_oddly, (4,), executor, 1))
 
