@@ -109,8 +109,8 @@ class Phone:
         size = 2 * self.noise_radius_px + 1
         if self.bilateral:
             image = np.sqrt(np.moveaxis(colours, 0, -1)).astype(np.float32)
-            smooth = cv2.bilateralFilter(image, size, self.bilateral, self.noise_radius_px)
-            return np.asarray(np.moveaxis(smooth.astype(float) ** 2, -1, 0))
+            filtered = cv2.bilateralFilter(image, size, self.bilateral, self.noise_radius_px)
+            return np.asarray(np.moveaxis(filtered.astype(float) ** 2, -1, 0))
         if not self.noise_reduction:
             return colours
         grey = _brightness(colours)
@@ -118,9 +118,9 @@ class Phone:
         scatter = np.maximum(uniform_filter(grey * grey, size) - mean * mean, 0.0)
         noise = (sensor.full_well_e * mean + sensor.read_noise_e**2) / sensor.full_well_e**2
         kept = scatter / (scatter + self.noise_reduction**2 * noise)
-        even = uniform_filter(kept, size) * grey + uniform_filter((1.0 - kept) * mean, size)
+        smooth = uniform_filter(kept, size) * grey + uniform_filter((1.0 - kept) * mean, size)
         tints = [uniform_filter(uniform_filter(c - grey, size), size) for c in colours]
-        return np.asarray(np.maximum(even + np.stack(tints), 0.0))
+        return np.asarray(np.maximum(smooth + np.stack(tints), 0.0))
 
     def _local_gain(self, grey: FloatArray) -> FloatArray:
         """Return the gain (height, width) that brings the surroundings nearer to middle grey."""
