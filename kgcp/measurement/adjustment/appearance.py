@@ -46,7 +46,7 @@ def appearance_of(camera: Camera, target: Target, fit: TargetFit) -> Appearance:
     return Appearance(
         radius_px=semi_major_axis_px(contour),
         black=min(max(black, 0.0), 1.0),
-        white=min(max(white, 0.0), 1.0),
+        white=min(max(white, 0.0), problem.brightest),
         saturated=float(np.mean(clipped[inside])),
         edge_shift_px=shift_px,
         blur_px=blur_px,
@@ -69,7 +69,8 @@ def places_across_edges_px(fit: TargetFit, level: float | None) -> FloatArray:
     there is one place; otherwise there is one for every pixel near an edge.
     """
     light, problem, field = fit.parameters.light, fit.sample.problem, fit.parameters.field
-    tone, high = problem.tone, problem.censoring.high
+    tone = problem.tone
+    high = problem.censoring.high if problem.burnt_white is None else problem.burnt_white
     if field is None:
         black, white = plateau_levels(light, tone)
         wanted = 0.5 * (black + min(white, high)) if level is None else level

@@ -28,6 +28,7 @@ from kgcp.measurement.adjustment.plateaus import (
     field_of,
     look_at_plateaus,
     shadows_across,
+    without_burnt_white,
 )
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.random_levels import (
@@ -89,6 +90,14 @@ class UnevenLightInBins(Exception):  # noqa: N818 - the outcome of one fit
     """The light on bins seems uneven: smaller ones are to be adjusted, or single pixels."""
 
 
+class WhiteIsBurnt(Exception):  # noqa: N818 - the outcome of one fit
+    """White is burnt below the end of the range: `problem` takes it for clipped."""
+
+    def __init__(self, problem: FitProblem) -> None:
+        super().__init__()
+        self.problem = problem
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FitsByTone:
     """The fits of one target by the tones that its camera may have."""
@@ -105,7 +114,8 @@ def fit_in_any_light(
 ) -> FitsByTone:
     """Adjust both poses; with an unknown tone over sRGB's curve and over a straight line.
 
-    Three shapes hold curves near either of them.
+    Three shapes hold curves near either of them. White that turns out to be burnt is taken for
+    clipped over both.
 
     Parameters
     ----------
@@ -120,6 +130,15 @@ def fit_in_any_light(
     UnevenLightInBins
         Only if the problem `may_be_finer`.
     """
+    try:
+        return _fit_over_bases(problem, pose, blur, base)
+    except WhiteIsBurnt as found:
+        return _fit_over_bases(replace(found.problem, tone=problem.tone), pose, blur, base)
+
+
+def _fit_over_bases(
+    problem: FitProblem, pose: Pose, blur: Blur, base: ToneBase | None
+) -> FitsByTone:
     # the same whatever the tone
     find_plateaus = cache(partial(look_at_plateaus, problem, pose, blur.mean_sd_px))
     if problem.tone is not Tone.UNKNOWN:
@@ -140,18 +159,21 @@ def fit_in_any_light(
     return _by_likelihood(fits)
 
 
-def with_untried_base(fits: FitsByTone, problem: FitProblem, pose: Pose, blur: Blur) -> FitsByTone:
+def with_untried_base(fits: FitsByTone, pose: Pose, blur: Blur) -> FitsByTone:
     """Return the fits with the one over the base that was not tried, unless it fails."""
     if fits.untried_base is None:
         return fits
-    toned = replace(problem, tone=TONE_OF_BASE[fits.untried_base])
-    find_plateaus = partial(look_at_plateaus, problem, pose, blur.mean_sd_px)
+    tried = fits.likelier.best.sample.problem  # without burnt white
+    toned = replace(tried, tone=TONE_OF_BASE[fits.untried_base])
+    find_plateaus = partial(look_at_plateaus, toned, pose, blur.mean_sd_px)
     try:
         other = _fit_in_any_light(toned, pose, blur, find_plateaus)
     except Rejection:
         return replace(fits, untried_base=None)
-    (tried,) = set(ToneBase) - {fits.untried_base}
-    return _by_likelihood({tried: fits.likelier, fits.untried_base: other})
+    except WhiteIsBurnt as found:
+        return fit_in_any_light(replace(found.problem, tone=Tone.UNKNOWN), pose, blur)
+    (first,) = set(ToneBase) - {fits.untried_base}
+    return _by_likelihood({first: fits.likelier, fits.untried_base: other})
 
 
 def _by_likelihood(fits: Mapping[ToneBase, TwoPoses]) -> FitsByTone:
@@ -220,6 +242,8 @@ def _fit_in_any_light(
         As `kgcp.measurement.adjustment.two_poses.fit_both_poses`; `OTHER_CODE` if the code is not
         seen where the levels are even; `POOR_FIT` if varying levels do not explain the image
         either.
+    WhiteIsBurnt
+        If white is not yet taken for clipped.
     UnevenLightInBins
         Only if the problem `may_be_finer`.
     """
@@ -251,6 +275,7 @@ def _best_in_any_light(
         plain = _with_shape(problem, fit_both_poses(problem, pose, blur))
     except Rejection:
         plateaus = find_plateaus()
+        _check_white(problem, plateaus)
         if plateaus is None or not plateaus.is_uneven:
             raise
         if problem.may_be_finer:
@@ -261,6 +286,7 @@ def _best_in_any_light(
     if problem.may_be_finer:
         raise UnevenLightInBins
     plateaus = find_plateaus()
+    _check_white(problem, plateaus)
     if start is not None:
         varying = _with_edge_tone(problem, _over_another_base(problem, start))
     elif plateaus is None or not plateaus.is_uneven:
@@ -270,6 +296,15 @@ def _best_in_any_light(
     else:
         varying = _in_seen_light(problem, pose, blur, plateaus)
     return plain if _may_be_even(plain.best, varying.best) else varying
+
+
+def _check_white(problem: FitProblem, plateaus: Plateaus | None) -> None:
+    """Raise `WhiteIsBurnt` if white is, and is not yet taken for clipped."""
+    if plateaus is None or problem.burnt_white is not None:
+        return
+    seen = without_burnt_white(problem, plateaus)
+    if seen.burnt_white is not None:
+        raise WhiteIsBurnt(seen)
 
 
 def _may_be_even(plain: TargetFit, varying: TargetFit) -> bool:

@@ -105,7 +105,7 @@ def measure_by_model(
     except Rejection:
         if fits.untried_base is None:
             raise
-        fits = with_untried_base(fits, problem, pose, blur)
+        fits = with_untried_base(fits, pose, blur)
         measurement = _checked(camera, target, start, fits.likelier, prior.normal)
     if fits.rival is not None:
         with contextlib.suppress(Rejection):  # then the likelier one has no rival

@@ -156,8 +156,7 @@ def background_mask(seen: SeenPlate, light: Light, slack_px: float = 0.0) -> Boo
         unblurred.points_m,
         unblurred.rho_m,
         seen.spread,
-        black,
-        white,
+        (black, white, problem.brightest),
         problem.outer_radius_m,
         blur.largest_sd_px * scale,
         slack_px * scale,
@@ -178,8 +177,7 @@ def _mark_foreign(
     points_m: FloatArray,
     rho_m: FloatArray,
     spread: FloatArray,
-    black: float,
-    white: float,
+    levels: tuple[float, float, float],
     radius_m: float,
     sd_m: float,
     slack_m: float,
@@ -190,8 +188,10 @@ def _mark_foreign(
     Beyond 2.6 σ from the ring, by a level that is not the plate's. Nearer, where the end of the
     plate may be within the blur of the ring, by one that is darker than Φ(distance / σ), the
     profile of the ring's own edge, makes it; σ is that of the blur in the pixel's direction.
+    `levels` are those of ink and plate, and the one that burnt white is seen with.
     """
-    count, level = 0, min(white, 1.0)
+    black, white, brightest = levels
+    count, level = 0, min(white, brightest)
     for i in range(len(smooth)):
         beyond_m, foreign[i] = rho_m[i] - radius_m, False
         if beyond_m > _CLEAR_SIGMAS * sd_m:
@@ -202,7 +202,7 @@ def _mark_foreign(
             sigmas = (beyond_m - slack_m) * rho_m[i] / (sd_m * math.sqrt(felt))
             if sigmas > _BESIDE_RING_SIGMAS:
                 share = 1.0 - 0.5 * math.erfc(sigmas * math.sqrt(0.5)) - _FOREIGN_CONTRAST
-                foreign[i] = smooth[i] < min(black + (white - black) * share, 1.0)
+                foreign[i] = smooth[i] < min(black + (white - black) * share, brightest)
         count += foreign[i]
     return count
 
@@ -230,7 +230,7 @@ def occluded_mask(seen: SeenPlate, light: Light, slack_px: float) -> BoolArray:
     if problem.outer_radius_px < _SMALLEST_SIGMAS * sd_px:
         return hidden
     black, white = plateau_levels(light, problem.tone)
-    contrast, scale = min(white, 1.0) - black, seen.metres_per_px
+    contrast, scale = min(white, problem.brightest) - black, seen.metres_per_px
     hidden_count, tested_count = _mark_hidden(
         problem.window.smooth,
         unblurred.share,

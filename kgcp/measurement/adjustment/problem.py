@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -51,6 +52,28 @@ class FitProblem:
     most_pixels: int | None = None  # that take part; None: all that are useful
     # whether bins that need levels that vary are to end in `UnevenLightInBins`
     may_be_finer: bool = False
+    # grey value that burnt white has below the end of the range; None: it is seen clipped
+    burnt_white: float | None = None
+
+    @property
+    def brightest(self) -> float:
+        """The grey value that burnt white is seen with."""
+        return 1.0 if self.burnt_white is None else self.burnt_white
+
+    def with_burnt_white(self, white: float, limit: float) -> FitProblem:
+        """Return the problem with a burnt white below the end of the range.
+
+        What is seen above `limit` counts as clipped, with the edge of that white.
+        """
+        levels = self.window.levels
+        return replace(
+            self,
+            window=replace(self.window, levels=np.minimum(levels, limit)),
+            censoring=replace(
+                self.censoring, high=limit, at_high=levels >= limit, ceiling=math.inf
+            ),
+            burnt_white=white,
+        )
 
     @property
     def is_ring_small(self) -> bool:

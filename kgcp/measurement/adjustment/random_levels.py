@@ -232,7 +232,7 @@ def _evened(problem: FitProblem, parameters: Parameters) -> FitProblem:
     light = parameters.light
     black, white = plateau_levels(light, problem.tone)
     ink, plate = (encoded(toned(x, light.values), problem.tone) for x in (added[0], 1.0 + added[1]))
-    white, plate = min(white, 1.0), np.minimum(plate, 1.0)  # burnt white is seen clipped
+    white, plate = min(white, problem.brightest), np.minimum(plate, problem.brightest)
     contrast = np.maximum(plate - ink, _LEAST_CONTRAST * (white - black))
     smooth = black + (window.smooth - ink) * (white - black) / contrast
     return replace(problem, window=replace(window, smooth=smooth))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -71,6 +72,25 @@ def test_the_other_base_is_tried_where_levels_leave_residuals_that_agree(
     assert tried == tones
     assert fits.untried_base == (None if len(tones) == 2 else ToneBase.SRGB)
     assert (fits.rival is None) == (len(tones) == 1)
+
+
+@pytest.mark.parametrize("settled", [None, ToneBase.LINE, ToneBase.SRGB])
+def test_white_that_is_burnt_is_taken_for_clipped_over_all_bases(
+    monkeypatch: pytest.MonkeyPatch, settled: ToneBase | None
+) -> None:
+    def fit(problem: FitProblem, *_: object) -> object:
+        if problem.burnt_white is None and problem.tone is Tone.UNKNOWN:  # the other one sees none
+            raise extensions.WhiteIsBurnt(replace(problem, burnt_white=0.92))
+        return stand_in(best=stand_in(level_equations=None, sample=stand_in(problem=problem)))
+
+    monkeypatch.setattr(extensions, "_fit_in_any_light", fit)
+    monkeypatch.setattr(extensions, "advantage_over", lambda *_: 2.0)
+    pose, blur = Pose(np.eye(3), np.array([0.0, 0.0, 9.0])), Blur(0.5, 0.5, 0.0)
+    fits = extensions.fit_in_any_light(problem_of_unknown_tone(), pose, blur, settled)
+    fits = extensions.with_untried_base(fits, pose, blur)
+    assert fits.rival is not None
+    for poses in (fits.likelier, fits.rival):
+        assert poses.best.sample.problem.burnt_white == 0.92
 
 
 @pytest.mark.parametrize(("inflation", "is_start"), [(2.9, True), (3.9, False)])
@@ -210,7 +230,7 @@ def test_small_rings_are_in_even_light_where_levels_explain_little_more(
 def test_bins_in_nearly_even_light_keep_the_levels_that_they_were_fitted_with(
     monkeypatch: pytest.MonkeyPatch, *, tone: Tone, starts_from_seen: bool
 ) -> None:
-    problem = stand_in(is_ring_small=False, may_be_finer=False, tone=tone)
+    problem = stand_in(is_ring_small=False, may_be_finer=False, burnt_white=0.9, tone=tone)
     plain = stand_in(best=stand_in(sample=stand_in(problem=problem)))
     seen, started_from = stand_in(is_uneven=False), []
 
@@ -240,7 +260,7 @@ def test_bins_in_nearly_even_light_keep_the_levels_that_they_were_fitted_with(
 def test_levels_over_a_second_base_start_from_those_over_the_first(
     monkeypatch: pytest.MonkeyPatch, *, levels_vary: bool, is_uneven: bool, fitted_from: list[str]
 ) -> None:
-    problem = stand_in(is_ring_small=False, may_be_finer=False, tone=Tone.UNKNOWN)
+    problem = stand_in(is_ring_small=False, may_be_finer=False, burnt_white=0.9, tone=Tone.UNKNOWN)
     sample = stand_in(problem=problem)
     parameters = stand_in(pose=Pose(np.eye(3), np.array([0.0, 0.0, 9.0])))
     plain = stand_in(best=stand_in(sample=sample, level_equations=None))

@@ -29,29 +29,30 @@ PIXELS = 4000
 BLACK, WHITE, RADIUS_M, SD_M, SLACK_M = 0.1, 0.8, 0.45, 0.02, 0.004
 
 
-@pytest.mark.parametrize("white", [0.8, 1.3])
+@pytest.mark.parametrize(("white", "brightest"), [(0.8, 1.0), (1.3, 1.0), (1.3, 0.9)])
 @pytest.mark.parametrize("seed", range(3))
-def test_foreign_is_what_is_neither_plate_nor_the_edge_of_the_ring(seed: int, white: float) -> None:
+def test_foreign_is_what_is_neither_plate_nor_the_edge_of_the_ring(
+    seed: int, white: float, brightest: float
+) -> None:
     rng = np.random.default_rng(seed)
     points_m = rng.uniform(-0.65, 0.65, (2, PIXELS))
     rho_m, smooth = np.hypot(*points_m), rng.uniform(0.0, 1.0, PIXELS)
     spread = np.array([1.0, 0.2, 0.5])
     foreign = np.empty(PIXELS, dtype=bool)
-    count = _mark_foreign(
-        smooth, points_m, rho_m, spread, BLACK, white, RADIUS_M, SD_M, SLACK_M, foreign
-    )
+    levels = BLACK, white, brightest
+    count = _mark_foreign(smooth, points_m, rho_m, spread, levels, RADIUS_M, SD_M, SLACK_M, foreign)
     expected = np.zeros(PIXELS, dtype=bool)
     for i in range(PIXELS):
         beyond_m = rho_m[i] - RADIUS_M
         if beyond_m > 2.6 * SD_M:
-            expected[i] = abs(smooth[i] - min(white, 1.0)) > 0.15 * (white - BLACK)
+            expected[i] = abs(smooth[i] - min(white, brightest)) > 0.15 * (white - BLACK)
         elif beyond_m > SLACK_M:
             direction = points_m[:, i] / rho_m[i]
             covariance = np.array([[spread[0], spread[1]], [spread[1], spread[2]]])
             sd_m = SD_M * math.sqrt(direction @ covariance @ direction)
             sigmas = (beyond_m - SLACK_M) / sd_m
             darkest = BLACK + (white - BLACK) * (norm.cdf(sigmas) - 0.15)
-            expected[i] = sigmas > 0.85 and smooth[i] < min(darkest, 1.0)
+            expected[i] = sigmas > 0.85 and smooth[i] < min(darkest, brightest)
     np.testing.assert_array_equal(foreign, expected)
     assert count == expected.sum()
     assert 100 < count < PIXELS - 100

@@ -12,7 +12,12 @@ import pytest
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.adjustment.plateaus import Plateaus, look_at_plateaus, shadows_across
+from kgcp.measurement.adjustment.plateaus import (
+    Plateaus,
+    look_at_plateaus,
+    shadows_across,
+    without_burnt_white,
+)
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.targets.layout import Target
 
@@ -151,3 +156,75 @@ def test_dots_of_another_code_are_not_light(
     more = replace(target.ring, code_deg=(*target.ring.code_deg, 230.0))
     _, plateaus = look(Target(more, target.replicas))
     assert not plateaus.is_uneven
+
+
+def noisy(problem: FitProblem, plate: float, of_ink: float, of_plate: float) -> FitProblem:
+    """Give a plate another level of white, and noise [grey values], and round it to grey values."""
+    window, rng = problem.window, np.random.default_rng(3)
+    share = np.clip((window.levels - 0.12) / (0.70 - 0.12), 0.0, 1.0)  # without its own noise
+    sd = np.where(share > 0.5, of_plate, of_ink) / 255.0
+    levels = 0.08 + (plate - 0.08) * share + sd * rng.standard_normal(len(share))
+    levels = np.rint(255.0 * np.minimum(levels, 1.0)) / 255.0
+    return replace(problem, window=replace(window, levels=levels, smooth=levels))
+
+
+@pytest.mark.parametrize(
+    ("plate", "of_ink", "of_plate", "is_burnt"),
+    [
+        (0.92, 1.0, 0.0, True),
+        (0.92, 1.0, 0.5, False),  # it shows noise as ink does
+        (0.92, 0.0, 0.0, False),  # a picture without noise does not tell
+        (0.75, 1.0, 0.0, False),  # too dark
+        (1.0, 1.0, 0.0, False),  # seen clipped
+    ],
+)
+def test_white_without_noise_below_the_end_of_the_range_is_burnt(
+    look: Callable[..., tuple[FitProblem, Plateaus]],
+    target: Target,
+    place_plate: Callable[..., Pose],
+    *,
+    plate: float,
+    of_ink: float,
+    of_plate: float,
+    is_burnt: bool,
+) -> None:
+    problem = noisy(look(target)[0], plate, of_ink, of_plate)
+    plateaus = look_at_plateaus(problem, place_plate(CENTRE_PX, 60.0, tilt_deg=10.0), 0.8)
+    assert plateaus is not None
+    seen = without_burnt_white(problem, plateaus)
+    if not is_burnt:
+        assert seen is problem
+        assert seen.brightest == 1.0
+        return
+    limit = 0.08 + 0.8 * (plate - 0.08)
+    assert seen.brightest == seen.burnt_white == pytest.approx(plate, abs=0.003)
+    assert seen.censoring.high == pytest.approx(limit, abs=0.004)
+    assert seen.window.levels.max() == seen.censoring.high
+    np.testing.assert_array_equal(
+        seen.censoring.at_high, problem.window.levels >= seen.censoring.high
+    )
+    np.testing.assert_array_equal(seen.window.smooth, problem.window.smooth)
+    for told_too_little in (
+        replace(problem, outer_radius_px=12.0),
+        replace(problem, window=replace(problem.window, binning=2)),
+    ):
+        assert without_burnt_white(told_too_little, plateaus) is told_too_little
+
+
+def test_burnt_white_is_seen_beside_shade(
+    look: Callable[..., tuple[FitProblem, Plateaus]],
+    target: Target,
+    place_plate: Callable[..., Pose],
+) -> None:
+    """Plate in shade has noise, and is as it is seen."""
+    problem = noisy(look(target)[0], 0.92, 1.0, 0.0)
+    window = problem.window
+    columns = window.pixels(np.arange(len(window.levels)))[0]
+    shaded = np.random.default_rng(5).normal(0.55 * window.levels, 1.0 / 255.0)
+    levels = np.where(columns > CENTRE_PX[0], shaded, window.levels)
+    problem = replace(problem, window=replace(window, levels=levels, smooth=levels))
+    plateaus = look_at_plateaus(problem, place_plate(CENTRE_PX, 60.0, tilt_deg=10.0), 0.8)
+    assert plateaus is not None
+    seen = without_burnt_white(problem, plateaus)
+    assert seen.burnt_white == pytest.approx(0.92, abs=0.01)
+    assert not np.any(seen.censoring.at_high & (columns > CENTRE_PX[0]))
