@@ -139,6 +139,7 @@ def fit_in_any_light(
 def _fit_over_bases(
     problem: FitProblem, pose: Pose, blur: Blur, base: ToneBase | None
 ) -> FitsByTone:
+    """Do what `fit_in_any_light` does; burnt white below the end of the range ends it."""
     # the same whatever the tone
     find_plateaus = cache(partial(look_at_plateaus, problem, pose, blur.mean_sd_px))
     if problem.tone is not Tone.UNKNOWN:
