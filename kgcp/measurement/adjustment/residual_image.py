@@ -76,7 +76,8 @@ def residual_image_of(
     if needs_varying_levels(fit):
         with contextlib.suppress(Rejection):  # a code that is not seen is what residuals show
             best = fit_in_any_light(problem, pose, start.blur).likelier.best
-            fit = best if best.parameters.field is not None else fit
+            is_burnt = best.sample.problem.burnt_white is not None
+            fit = best if is_burnt or best.parameters.field is not None else fit
     problem = fit.sample.problem  # which says over which curve an unknown tone was fitted
     parameters = fit.parameters.at(pose)
     light = parameters.light
