@@ -615,3 +615,16 @@ def test_the_light_that_was_fitted_can_be_seen(photograph: Photograph) -> None:
     assert np.nanmin(uneven.white) == pytest.approx(0.5, abs=0.06)
     assert np.array_equal(np.isnan(uneven.white), np.isnan(uneven.share))
     assert np.nanmedian(np.abs(uneven.share)) < 0.03
+
+
+def test_residuals_of_a_large_plate_in_shade_are_those_of_single_pixels(
+    photograph: Photograph,
+) -> None:
+    """Bins, which hide a tone curve, left twice as much at its edges."""
+    camera, rng = replace(LENS, response=Response.UNKNOWN), np.random.default_rng(77)
+    pose = some_pose(rng, 152.0)
+    sensor = Sensor(tone=ToneCurve.SRGB)
+    grey = photograph(camera, pose, rng, sensor=sensor, gain=0.6, field=shadow_edge(rng))
+    left = residual_image_of(grey, camera, TARGET_PLATE.target, pose, 0.7)
+    assert 0.006 < left.edge_noise < 0.014
+    assert np.nanmedian(np.abs(left.share)) > 0.006  # noise of pixels, not of means over four

@@ -96,8 +96,8 @@ def measure_by_model(
     try:
         fits = fit_in_any_light(problem, pose, blur, prior.tone_base)
     except UnevenLightInBins:
-        finer = fit_problem_of(grey, camera, target, pose, prior.rotation, _LARGEST_UNEVEN_PX)
-        problem = replace(finer, visible=visible, most_pixels=_MOST_PIXELS)
+        finer = finer_problem_of(grey, camera, target, pose, prior.rotation)
+        problem = replace(finer, visible=visible)
         blur = _start_blur(start, problem.window.binning)
         fits = fit_in_any_light(problem, pose, blur, prior.tone_base)
     try:
@@ -197,6 +197,18 @@ def fit_problem_of(
             shutter=shutter,
         )
     raise Rejection(*cut)
+
+
+def finer_problem_of(
+    grey: GreyArray,
+    camera: Camera,
+    target: Target,
+    pose: Pose,
+    rotation: SceneRotation | None = None,
+) -> FitProblem:
+    """Do what `fit_problem_of` does, for uneven light: on smaller bins, or some single pixels."""
+    finer = fit_problem_of(grey, camera, target, pose, rotation, _LARGEST_UNEVEN_PX)
+    return replace(finer, most_pixels=_MOST_PIXELS)
 
 
 def _measured_count(camera: Camera, target: Target, contour: FloatArray) -> int:

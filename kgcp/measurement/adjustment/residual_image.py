@@ -13,15 +13,16 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.acceptance import edge_noise
 from kgcp.measurement.adjustment.extensions import fit_in_any_light
-from kgcp.measurement.adjustment.fit_target import fit_problem_of
+from kgcp.measurement.adjustment.fit_target import finer_problem_of, fit_problem_of
 from kgcp.measurement.adjustment.masks import first_levels
 from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.adjustment.pixels import whole_plate
+from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.random_levels import needs_varying_levels
 from kgcp.measurement.adjustment.solver import predict
 from kgcp.measurement.adjustment.unknowns import adjust_with_streak
 from kgcp.measurement.image_model.blur import Blur, variance_in_bins
-from kgcp.measurement.image_model.photometry import plateau_levels
+from kgcp.measurement.image_model.photometry import Tone, plateau_levels
 from kgcp.measurement.image_model.plate import circles_of
 from kgcp.targets.layout import Target
 
@@ -69,16 +70,19 @@ def residual_image_of(
         As `kgcp.measurement.adjustment.fit_target.measure_by_model`.
     """
     problem = fit_problem_of(grey, camera, target, pose)
-    binning = problem.window.binning
-    variance = variance_in_bins((blur_px or _USUAL_BLUR_PX) ** 2, binning)
-    start = Parameters.of(pose, Blur(variance, variance, 0.0), first_levels(problem, pose))
+    start = Parameters.of(pose, _blur_in_bins(blur_px, problem), first_levels(problem, pose))
     fit = adjust_with_streak(problem, start, moves=False)
     if needs_varying_levels(fit):
+        is_binned = problem.tone is Tone.OF_BINS
+        if is_binned:  # as in a measurement
+            problem = finer_problem_of(grey, camera, target, pose)
+        blur = _blur_in_bins(blur_px, problem)
         with contextlib.suppress(Rejection):  # a code that is not seen is what residuals show
-            best = fit_in_any_light(problem, pose, start.blur).likelier.best
-            is_burnt = best.sample.problem.burnt_white is not None
-            fit = best if is_burnt or best.parameters.field is not None else fit
+            best = fit_in_any_light(problem, pose, blur).likelier.best
+            is_even = best.parameters.field is None and best.sample.problem.burnt_white is None
+            fit = fit if is_even and not is_binned else best
     problem = fit.sample.problem  # which says over which curve an unknown tone was fitted
+    binning = problem.window.binning
     parameters = fit.parameters.at(pose)
     light = parameters.light
     sample = whole_plate(problem, pose, parameters.blur, light)
@@ -107,6 +111,12 @@ def residual_image_of(
         edge_noise=edge_noise(fit),
         white=None if white_share is None else of_pixels(white_share),
     )
+
+
+def _blur_in_bins(blur_px: float | None, problem: FitProblem) -> Blur:
+    """Return a round blur of an edge spread σ [px], in the window's bins."""
+    variance = variance_in_bins((blur_px or _USUAL_BLUR_PX) ** 2, problem.window.binning)
+    return Blur(variance, variance, 0.0)
 
 
 def contours_px(camera: Camera, target: Target, pose: Pose) -> FloatArray:
