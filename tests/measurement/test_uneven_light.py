@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import norm
 
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, GreyArray
@@ -28,6 +29,7 @@ from kgcp.measurement.adjustment.residual_image import residual_image_of
 from kgcp.measurement.adjustment.solver import TargetFit
 from kgcp.measurement.adjustment.two_poses import TwoPoses
 from kgcp.measurement.frame import examine
+from kgcp.measurement.image_model.srgb import srgb_decoded
 from kgcp.measurement.records import InitialPose, Measurement, Miss, ToneBase
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import TARGET_PLATE
@@ -291,13 +293,22 @@ def test_edges_beside_burnt_white_seem_displaced_by_the_white_that_is_seen(
 ) -> None:
     """By the limit above which all counts as clipped, it would be 0.7 px."""
     camera, rng = replace(LENS, response=Response.UNKNOWN), np.random.default_rng(31)
-    pose = some_pose(rng, 110.0)
-    grey = phone_photograph(pose, rng, Phone(), gain=1.5)
+    pose, gain = some_pose(rng, 110.0), 1.5
+    grey = phone_photograph(pose, rng, Phone(), gain=gain)
     seen = measure_by_model(grey, camera, TARGET_PLATE.target, start_near(camera, pose, rng))
     appearance = seen.appearance
     assert 0.25 < appearance.saturated < 0.4
     assert 0.9 < appearance.white < 0.98
-    assert appearance.edge_shift_px == pytest.approx(0.48, abs=0.06)
+    # the camera's own straight edge: clipped light, darkened, through sRGB's curve
+    off_px = np.linspace(-3.0, 3.0, 601)
+    share = norm.cdf(off_px / math.hypot(0.7, 12.0**-0.5))
+    light = np.minimum(
+        gain * (TARGET_PLATE.black + (TARGET_PLATE.white - TARGET_PLATE.black) * share), 1.0
+    )
+    darkened = srgb_decoded(np.array([appearance.white]))
+    edge = ToneCurve.SRGB.apply(darkened * light)
+    midway = np.interp(0.5 * (edge[0] + edge[-1]), edge, off_px)
+    assert appearance.edge_shift_px == pytest.approx(-midway, abs=0.07)
     residuals = residual_image_of(
         grey, camera, TARGET_PLATE.target, seen.pose, appearance.blur_px
     ).share

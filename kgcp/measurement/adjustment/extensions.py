@@ -276,7 +276,7 @@ def _best_in_any_light(
         plain = _with_shape(problem, fit_both_poses(problem, pose, blur))
     except Rejection:
         plateaus = find_plateaus()
-        _check_white(problem, plateaus)
+        _raise_if_burnt(problem, plateaus)
         if plateaus is None or not plateaus.is_uneven:
             raise
         if problem.may_be_finer:
@@ -287,7 +287,7 @@ def _best_in_any_light(
     if problem.may_be_finer:
         raise UnevenLightInBins
     plateaus = find_plateaus()
-    _check_white(problem, plateaus)
+    _raise_if_burnt(problem, plateaus)
     if start is not None:
         varying = _with_edge_tone(problem, _over_another_base(problem, start))
     elif plateaus is None or not plateaus.is_uneven:
@@ -299,7 +299,7 @@ def _best_in_any_light(
     return plain if _may_be_even(plain.best, varying.best) else varying
 
 
-def _check_white(problem: FitProblem, plateaus: Plateaus | None) -> None:
+def _raise_if_burnt(problem: FitProblem, plateaus: Plateaus | None) -> None:
     """Raise `WhiteIsBurnt` if white is, and is not yet taken for clipped."""
     if plateaus is None or problem.burnt_white is not None:
         return

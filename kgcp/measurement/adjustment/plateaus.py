@@ -87,14 +87,13 @@ def without_burnt_white(problem: FitProblem, plateaus: Plateaus) -> FitProblem:
     """Return the problem with white taken for clipped, if it is burnt below the end of the range.
 
     Cameras that map tones locally, or to another exposure, do so after the sensor has clipped.
-    White is brighter there than it seems, and edges of ink beside it are displaced, by a curve that
-    no tone curve's shapes follow. It shows by its noise, of which less is left than rounding alone
-    makes.
+    The plate is brighter there than it seems, and its edges are displaced by a curve that no three
+    shapes follow. What gives burnt white away is its noise, less than rounding alone makes.
     """
-    is_told = problem.window.binning == 1 and not problem.is_ring_small
+    shows_noise = problem.window.binning == 1 and not problem.is_ring_small
     ink, plate = plateaus.typical[0], plateaus.extremes[1]
     least, most = _BURNT_WHITE
-    if not is_told or not least < plate < most * problem.censoring.high:
+    if not shows_noise or not least < plate < most * problem.censoring.high:
         return problem
     dark, bright = plateaus.flat
     bright = bright[problem.window.smooth[bright] > plate - _LIT * (plate - ink)]
