@@ -47,7 +47,6 @@ _LEAST_RADIUS_PX = 5.0  # of discs to learn from, if there are enough
 # From there on, the two levels fall off differently enough to tell, but for an unknown curve.
 _LARGE_RADIUS_PX = 20.0
 _LARGEST_BLUR = 0.3  # of the radius, to start from
-_LEAST_SD = 0.01  # of each parameter, however many discs agree
 # Masks are tried from 1 px on by steps of this factor, if the camera sharpens at all.
 _MASK_STEP, _MOST_STEPS = 1.25, 2
 _LEAST_SHARPENING, _SIGNIFICANT = 0.05, 4.0
@@ -83,6 +82,11 @@ _KURTOSIS_STEP, _DEFOCUSED_STEP, _MOST_KURTOSIS_STEPS = 0.2, -3.0, 3
 # have 23 and 30 (`benchmarks.calibrate.operator`).
 _WORTHY_KURTOSIS, _WORTHY_IN_COMPRESSED = 16.0, 100.0
 _LITTLE_BENT = 0.02  # standard deviation of the waves of a curve that is not bent
+# By how much of the blur an unknown curve may displace all edges alike, as standard deviation. One
+# that three parameters do not hold does it by 0.05 to 0.13 px where σ is 0.67 px (case
+# `unknown_film` of `benchmarks.calibrate.operator`); one that few discs do not show to be bent is
+# known no better.
+_OF_UNKNOWN_CURVE = 0.15
 # Of χ² with so many degrees of freedom; with none, discs share nothing to contradict each other in.
 _MEDIAN_SQUARE = {0: 1.0, 1: 0.455, 4: 3.357}
 
@@ -96,6 +100,8 @@ class CameraTone:
     known: ProcessingPrior | None = None
     blur_px: float = 0.0  # median of those that it was learned from; 0: none
     kurtosis: float = 0.0  # excess of its point spread's
+    edge_doubt: float = 0.0  # as of `DiscUnknowns`, by the curve
+    is_compressed: bool = False
     is_reliable: bool = True  # or compression has left too little of the photographs to tell it
 
 
@@ -107,8 +113,8 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     is burnt and black sunk, little of the curve is seen, and its bends explain what the model of
     the image lacks. Then the width of the mask is adjusted, where the camera sharpens. If the curve
     that is likeliest so far says that the camera is out of focus, all are compared once more with
-    the kurtosis of such a point spread. A curve that is stated may bend a little in each disc where
-    photographs are compressed.
+    the kurtosis of such a point spread. Where white is burnt, an unknown curve that is not bent for
+    all discs may bend a little in each.
     """
     tone = Tone.of(response)
     chosen = [task for tasks in photographs for task in _to_learn_from(tasks)]
@@ -117,8 +123,10 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     in_focus = _likeliest(bent or plain)
     sds = [fit.sd for fit in fits]  # the same for all that is compared
     kurtosis = 0.0 if in_focus is None else _learned_kurtosis(in_focus, sds)
+    edge_doubt = _OF_UNKNOWN_CURVE if tone is Tone.UNKNOWN else 0.0
+    is_compressed = _are_compressed(fits)
     if tone is Tone.LINEAR:
-        return CameraTone(tone, kurtosis=kurtosis)
+        return CameraTone(tone, kurtosis=kurtosis, is_compressed=is_compressed)
     if kurtosis:
         fits = [_with_kurtosis(fit, kurtosis) for fit in fits]
         plain, bent = _by_curves(fits, tone)
@@ -129,7 +137,7 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
         ]
     )
     if best is None:
-        return CameraTone(tone, SHARPENING_PX, kurtosis=kurtosis)
+        return CameraTone(tone, SHARPENING_PX, kurtosis=kurtosis, edge_doubt=edge_doubt)
     base = _BENT.get(min(plain, key=lambda joint: joint.loss).tone) if plain else None
     start = next((joint for joint in bent if joint.tone is base), None)
     is_reliable = True
@@ -139,13 +147,20 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
         is_reliable = best.is_settled and not _are_coarse(steps)
     blur_px = float(np.median([fit.state.blur.mean_sd_px for fit in best.fits]))
     known = _known_by(best)
-    may_bend = tone is Tone.UNKNOWN or _are_compressed(best.fits)
-    if may_bend and not best.tone.is_shaped:
-        # what an unknown curve may be off stays in the covariances; so does what compression makes
-        # of a stated one, by which radii would be off by five deviations
-        known = _without_bends(known)
+    if tone is Tone.UNKNOWN and not best.tone.is_shaped and _are_burnt(fits):
+        # its upper end is not seen: what it may be off stays in the covariances
+        known = _slightly_bent(known)
         best = replace(best, tone=_BENT[best.tone])
-    return CameraTone(best.tone, best.sharpening_px, known, blur_px, kurtosis, is_reliable)
+    return CameraTone(
+        best.tone,
+        best.sharpening_px,
+        known,
+        blur_px,
+        kurtosis,
+        edge_doubt,
+        is_compressed,
+        is_reliable,
+    )
 
 
 def unknowns_of_disc(task: DiscTask, camera: CameraTone) -> DiscUnknowns:
@@ -156,6 +171,8 @@ def unknowns_of_disc(task: DiscTask, camera: CameraTone) -> DiscUnknowns:
         sharpening_px=camera.sharpening_px,
         has_ink_slope=not camera.tone.is_shaped and task.radius_px >= _LARGE_RADIUS_PX,
         kurtosis=camera.kurtosis,
+        edge_doubt=camera.edge_doubt,
+        is_compressed=camera.is_compressed,
     )
 
 
@@ -284,7 +301,12 @@ def _worthy(plain: Sequence[JointFit], bent: Sequence[JointFit]) -> list[JointFi
     return [joint for joint in bent if joint.loss - best.loss < _NEARLY * gain]
 
 
-def _without_bends(known: ProcessingPrior) -> ProcessingPrior:
+def _are_burnt(fits: Sequence[DiscFit]) -> bool:
+    """Return whether a level of most discs is clipped."""
+    return float(np.mean([fit.sample.is_burnt for fit in fits])) > 0.5
+
+
+def _slightly_bent(known: ProcessingPrior) -> ProcessingPrior:
     """Return what is known of the camera with bends that are hardly there."""
     precision = known.precision.copy()
     waves = np.arange(WAVES)
@@ -490,9 +512,7 @@ def _known_by(joint: JointFit) -> ProcessingPrior:
 
     Where they contradict each other more than their noise lets them, it is known so much worse.
     """
-    cov = np.linalg.inv(joint.precision) * _excess(joint)
-    cov += _LEAST_SD**2 * np.eye(len(cov))
-    return ProcessingPrior(joint.shared, np.asarray(np.linalg.inv(cov)))
+    return ProcessingPrior(joint.shared, joint.precision / _excess(joint))
 
 
 def _excess(joint: JointFit) -> float:

@@ -22,6 +22,7 @@ from kgcp.measurement.discs.disc_levels import GEOMETRY_COUNT
 from kgcp.measurement.discs.fit_disc import DiscFit
 from kgcp.measurement.discs.pixel_choice import outward_px
 from kgcp.measurement.image_model.noise import median_at_edges
+from kgcp.measurement.image_model.photometry import Tone
 
 _ARC_PX = 6.0
 _FEWEST_ARCS = 8
@@ -38,16 +39,19 @@ _ARC_VARIANCE, _BLOCK_VARIANCE, _PIXEL_VARIANCE = 2.0, 1.5, 2.5
 _FLOOR_PX = 0.0002
 _COMMON_SHARE = 0.25  # where edges scatter more than noise makes them, so much of it, …
 _EXTRAPOLATED_SHARE = 0.025  # … and so much of how far they are beyond what is not clipped
-# Of the blur: an unknown tone curve that three parameters do not hold displaces all edges alike, by
-# 0.05 to 0.13 px where σ is 0.67 px (`benchmarks.calibrate.operator`, case `unknown_film`).
-_TONED_SHARE = 0.15
-# Of a ring that is measured as a whole, whose edges tell that displacement, this much is left:
-# 0.012 px by a film's curve, 0.001 px by sRGB's. Edges nearer to each other than so many px, or
+# Of the blur: compression displaces all edges alike. Where σ is 0.67 px, quality 92 and 85 do it by
+# 0.02 to 0.06 px, and where white is burnt by 0.05 and 0.18 px (`benchmarks.calibrate.operator`,
+# cases `srgb_jpeg` and `clipped_jpeg`). A curve that could bend in each disc would take it up
+# instead, and displace centres where the light falls off: by 0.005 px at R 150 px, 1.9 deviations.
+_OF_COMPRESSION, _OF_COMPRESSION_OF_BURNT = 0.08, 0.3
+# Of what compression or an unknown tone curve may displace all edges by, so much is left of a ring
+# that is measured as a whole, whose edges tell it: of the 0.1 px of a bent curve 0.007 px, where a
+# film's leaves 0.012 px and sRGB's 0.001 px. Edges nearer to each other than so many px, or
 # standard deviations of the blur, tell it wrongly: by a film's curve distances were off by 3 % at R
 # 2.5 px and by 1.1 % at 3 px.
-_TONED_RING_SHARE, _LEAST_GAP_PX, _LEAST_GAP = 0.01, 1.9, 3.0
-# … and where the light falls off, it displaces opposite edges differently: of the blur, for light
-# that falls off by all of itself over one radius. What discs had in common in ten draws of
+_LEFT_OF_RING, _LEAST_GAP_PX, _LEAST_GAP = 1.0 / 15.0, 1.9, 3.0
+# Where the light falls off, a bent curve displaces opposite edges differently: of the blur, for
+# light that falls off by all of itself over one radius. What discs had in common in ten draws of
 # photographs was half of this (R 8 and 15 px), and twice this for one case of twelve.
 _TONED_FALL = 0.05
 
@@ -96,8 +100,7 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
     equal = float(shares.sum() ** 2 / np.sum(shares * shares))
     over_blocks = BlockScatter(float(np.sum(sums * sums)) / expected, expected, equal)
     if _edges_tell_displacement(fit):  # then `RingUnknowns` has what that does
-        left_px = _TONED_RING_SHARE * fit.state.blur.mean_sd_px if fit.free.tone.is_shaped else 0.0
-        common_px = max(_FLOOR_PX, left_px)
+        common_px = max(_FLOOR_PX, _LEFT_OF_RING * _of_camera_px(fit))
     else:
         common_px = common_displacement_px(fit)
     # an edge that is displaced everywhere grows both semi-axes alike: M by the identity
@@ -243,8 +246,22 @@ def common_displacement_px(fit: DiscFit) -> float:
     hidden = max(0.5 - burnt, sunk - 0.5, 0.0)
     reach_px = blur_px * float(ndtri(min(0.5 + hidden, 1.0 - 1e-3)))
     of_edges_px = _COMMON_SHARE * math.sqrt(max(at_edges, 0.0)) / slope_per_px
-    of_tone_px = _TONED_SHARE * blur_px if tone.is_shaped else 0.0
-    return max(_FLOOR_PX, _EXTRAPOLATED_SHARE * reach_px, of_edges_px, of_tone_px)
+    return max(_FLOOR_PX, _EXTRAPOLATED_SHARE * reach_px, of_edges_px, _of_camera_px(fit))
+
+
+def _of_camera_px(fit: DiscFit) -> float:
+    """Return by how much the camera may displace all edges alike, as standard deviation [px].
+
+    Compression takes as much from both sides of an edge that is alike on both. Curves and burnt
+    white make it differ. In burnt photographs it shows by clipped values that are smeared.
+    """
+    free, limits, of_compression = fit.free, fit.sample.censoring, 0.0
+    if fit.sample.is_burnt:
+        is_smeared = math.isfinite(limits.ceiling) or math.isfinite(limits.floor)
+        of_compression = _OF_COMPRESSION_OF_BURNT * (free.is_compressed or is_smeared)
+    elif free.tone is not Tone.LINEAR:
+        of_compression = _OF_COMPRESSION * free.is_compressed
+    return math.hypot(free.edge_doubt, of_compression) * fit.state.blur.mean_sd_px
 
 
 def _edges_tell_displacement(fit: DiscFit) -> bool:

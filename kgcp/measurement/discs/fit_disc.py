@@ -105,6 +105,9 @@ class DiscUnknowns:
     precision: FloatArray  # (21, 21); zeros: nothing is known
     is_tone_stated: bool  # or it is one to start from
     kurtosis: float = 0.0  # excess of the point spread's, which is known
+    # by how much of the blur the curve may displace all edges alike, as standard deviation
+    edge_doubt: float = 0.0
+    is_compressed: bool = False  # the photograph
 
     @classmethod
     def of(
@@ -116,6 +119,8 @@ class DiscUnknowns:
         has_ink_slope: bool = False,
         is_tone_stated: bool = True,
         kurtosis: float = 0.0,
+        edge_doubt: float = 0.0,
+        is_compressed: bool = False,
     ) -> DiscUnknowns:
         """Return the unknowns of a disc.
 
@@ -131,6 +136,10 @@ class DiscUnknowns:
             Whether the tone is the camera's, or one to start from.
         kurtosis : float
             Excess of that of the camera's point spread.
+        edge_doubt : float
+            By how much of the blur the curve may displace all edges alike, as standard deviation.
+        is_compressed : bool
+            Whether the photograph is a JPEG, or was one.
         """
         rows = [*_ALWAYS, *_LIGHT]
         rows += _WAVES if tone.is_shaped else ()
@@ -147,7 +156,17 @@ class DiscUnknowns:
             mean[Row.WHITE], precision[Row.WHITE, Row.WHITE] = _WHITE, _WHITE_SD**-2
         is_fixed = ~np.isin(np.arange(COUNT), free)
         precision[is_fixed], precision[:, is_fixed] = 0.0, 0.0
-        return cls(tone, sharpening_px, free, mean, precision, is_tone_stated, kurtosis)
+        return cls(
+            tone,
+            sharpening_px,
+            free,
+            mean,
+            precision,
+            is_tone_stated,
+            kurtosis,
+            edge_doubt,
+            is_compressed,
+        )
 
     def without_ink_slope(self) -> DiscUnknowns:
         """Return the unknowns without a gradient of the darker level's own."""

@@ -20,6 +20,7 @@ from kgcp.measurement.image_model.noise import Censoring
 from kgcp.measurement.image_model.photometry import Tone
 from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, field_irradiance, photograph
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
+from tests.measurement.jpeg import compressed
 
 CAMERA = Camera(330, 250, 1000.0, 1000.0, 165.0, 125.0)
 POSE = Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
@@ -73,7 +74,7 @@ def test_a_line_is_bent_itself_unless_srgb_s_curve_is_much_likelier(
     ("curve", "tone", "waves"),
     [
         (ToneCurve.FILM, Tone.UNKNOWN, (0.0, -0.7, 0.0)),
-        (ToneCurve.LINEAR, Tone.UNKNOWN_FROM_LINE, (0.0, 0.0, 0.0)),
+        (ToneCurve.LINEAR, Tone.LINEAR, (0.0, 0.0, 0.0)),
     ],
 )
 def test_curve_and_sharpening_are_those_of_the_camera(
@@ -94,11 +95,16 @@ def test_curve_and_sharpening_are_those_of_the_camera(
 
 
 def small_discs(
-    sensor: Sensor, levels: tuple[float, float], gradient: float, seed: int
+    sensor: Sensor, levels: tuple[float, float], gradient: float, seed: int, quality: int = 0
 ) -> list[list[DiscTask]]:
-    """Return the discs of R 5 px of three photographs; dark ones if the first level is brighter."""
+    """Return the discs of R 5 px of three photographs; dark ones if the first level is brighter.
+
+    The photographs are JPEGs of some quality; 0: they are not compressed.
+    """
     rng = np.random.default_rng(seed)
     photos = [sensor.expose(light_of(levels, gradient, row), 1.0, rng) for row in range(3)]
+    if quality:
+        photos = [compressed(photo, quality) for photo in photos]
     return [[DiscTask(photo, each, []) for each in find_outlines(photo)] for photo in photos]
 
 
@@ -121,6 +127,25 @@ def test_no_pixels_are_not_burnt() -> None:
     assert Censoring(0.998, 0.002, both, both).share == 0.5
 
 
+@pytest.mark.parametrize(
+    ("sensor", "response", "quality", "doubt"),
+    [
+        (Sensor(), Response.LINEAR, 0, 0.0),
+        (Sensor(), Response.LINEAR, 85, 0.0),
+        (Sensor(tone=ToneCurve.SRGB), Response.SRGB, 0, 0.0),
+        (Sensor(tone=ToneCurve.SRGB), Response.SRGB, 85, 0.0),
+        (Sensor(), Response.UNKNOWN, 0, 0.15),
+        (Sensor(tone=ToneCurve.FILM), Response.UNKNOWN, 0, 0.15),
+    ],
+)
+def test_edges_are_doubtful_by_curves_that_are_not_known_and_by_compression(
+    sensor: Sensor, response: Response, quality: int, doubt: float
+) -> None:
+    learned = learn_tone(small_discs(sensor, (0.62, 0.1), 0.004, 0, quality), response)
+    assert learned.edge_doubt == doubt
+    assert learned.is_compressed == (quality > 0)
+
+
 def test_what_is_usual_of_burnt_white_does_not_bend_the_curve() -> None:
     """Said by each disc, it did: first wave −0.19."""
     tasks = small_discs(Sensor(tone=ToneCurve.FILM), (0.62, 0.1), 0.004, 0)
@@ -138,7 +163,7 @@ def test_noise_does_not_bend_a_straight_line(levels: tuple[float, float], seed: 
     tasks = small_discs(Sensor(sharpening=0.5 * (seed > 0)), levels, 0.0, seed)
     learned = learn_tone(tasks, Response.UNKNOWN)
     assert learned.known is not None
-    assert learned.tone is Tone.UNKNOWN_FROM_LINE
+    assert learned.tone is Tone.LINEAR
     assert learned.known.mean[:3].tolist() == [0.0, 0.0, 0.0]
     assert learned.known.mean[3] == pytest.approx(0.5 * (seed > 0), abs=0.15)
 
@@ -162,7 +187,7 @@ def test_the_edge_of_a_shadow_does_not_bend_the_curve() -> None:
         [[DiscTask(grey, outline, []) for outline in find_outlines(grey)]], Response.UNKNOWN
     )
     assert camera.known is not None
-    assert camera.tone is Tone.UNKNOWN_FROM_LINE
+    assert camera.tone is Tone.LINEAR
     assert camera.known.mean[:4] == pytest.approx(np.zeros(4), abs=0.02)
 
 
