@@ -44,6 +44,10 @@ _EXTRAPOLATED_SHARE = 0.025  # … and so much of how far they are beyond what i
 # cases `srgb_jpeg` and `clipped_jpeg`). A curve that could bend in each disc would take it up
 # instead, and displace centres where the light falls off: by 0.005 px at R 150 px, 1.9 deviations.
 _OF_COMPRESSION, _OF_COMPRESSION_OF_BURNT = 0.08, 0.3
+# Of the blur, too: out of focus, the point spread has more to it than a kurtosis. The half of an
+# edge that is not burnt shows it as a displacement of 0.035 to 0.08 px (σ 1.2 px, the same
+# benchmark, case `defocused_clipped`).
+_OUT_OF_FOCUS_AND_BURNT = 0.04
 # Of what compression or an unknown tone curve may displace all edges by, so much is left of a ring
 # that is measured as a whole, whose edges tell it: of the 0.1 px of a bent curve 0.007 px, where a
 # film's leaves 0.012 px and sRGB's 0.001 px. Edges nearer to each other than so many px, or
@@ -255,13 +259,16 @@ def _of_camera_px(fit: DiscFit) -> float:
     Compression takes as much from both sides of an edge that is alike on both. Curves and burnt
     white make it differ. In burnt photographs it shows by clipped values that are smeared.
     """
-    free, limits, of_compression = fit.free, fit.sample.censoring, 0.0
+    free, limits = fit.free, fit.sample.censoring
+    of_compression = of_focus = 0.0
     if fit.sample.is_burnt:
+        of_focus = _OUT_OF_FOCUS_AND_BURNT if free.kurtosis else 0.0
         is_smeared = math.isfinite(limits.ceiling) or math.isfinite(limits.floor)
         of_compression = _OF_COMPRESSION_OF_BURNT * (free.is_compressed or is_smeared)
     elif free.tone is not Tone.LINEAR:
         of_compression = _OF_COMPRESSION * free.is_compressed
-    return math.hypot(free.edge_doubt, of_compression) * fit.state.blur.mean_sd_px
+    doubt = math.hypot(free.edge_doubt, of_compression, of_focus)
+    return doubt * fit.state.blur.mean_sd_px
 
 
 def _edges_tell_displacement(fit: DiscFit) -> bool:
