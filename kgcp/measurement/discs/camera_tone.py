@@ -137,7 +137,13 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
         ]
     )
     if best is None:
-        return CameraTone(tone, SHARPENING_PX, kurtosis=kurtosis, edge_doubt=edge_doubt)
+        return CameraTone(
+            tone,
+            SHARPENING_PX,
+            kurtosis=kurtosis,
+            edge_doubt=edge_doubt,
+            is_compressed=is_compressed,
+        )
     base = _BENT.get(min(plain, key=lambda joint: joint.loss).tone) if plain else None
     start = next((joint for joint in bent if joint.tone is base), None)
     is_reliable = True

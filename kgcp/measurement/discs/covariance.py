@@ -256,8 +256,8 @@ def common_displacement_px(fit: DiscFit) -> float:
 def _of_camera_px(fit: DiscFit) -> float:
     """Return by how much the camera may displace all edges alike, as standard deviation [px].
 
-    Compression takes as much from both sides of an edge that is alike on both. Curves and burnt
-    white make it differ. In burnt photographs it shows by clipped values that are smeared.
+    Compression takes as much from both sides of an edge, unless a curve or burnt white makes them
+    differ. Where all is burnt, clipped values that are smeared show that there was compression.
     """
     free, limits = fit.free, fit.sample.censoring
     of_compression = of_focus = 0.0
