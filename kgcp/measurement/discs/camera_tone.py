@@ -82,11 +82,6 @@ _KURTOSIS_STEP, _DEFOCUSED_STEP, _MOST_KURTOSIS_STEPS = 0.2, -3.0, 3
 # have 23 and 30 (`benchmarks.calibrate.operator`).
 _WORTHY_KURTOSIS, _WORTHY_IN_COMPRESSED = 16.0, 100.0
 _LITTLE_BENT = 0.02  # standard deviation of the waves of a curve that is not bent
-# By how much of the blur an unknown curve may displace all edges alike, as standard deviation. One
-# that three parameters do not hold does it by 0.05 to 0.13 px where σ is 0.67 px (case
-# `unknown_film` of `benchmarks.calibrate.operator`); one that few discs do not show to be bent is
-# known no better.
-_OF_UNKNOWN_CURVE = 0.15
 # Of χ² with so many degrees of freedom; with none, discs share nothing to contradict each other in.
 _MEDIAN_SQUARE = {0: 1.0, 1: 0.455, 4: 3.357}
 
@@ -100,8 +95,8 @@ class CameraTone:
     known: ProcessingPrior | None = None
     blur_px: float = 0.0  # median of those that it was learned from; 0: none
     kurtosis: float = 0.0  # excess of its point spread's
-    edge_doubt: float = 0.0  # as of `DiscUnknowns`, by the curve
-    is_compressed: bool = False
+    is_curve_unknown: bool = False  # or it is stated
+    is_compressed: bool = False  # a photograph, as far as that shows
     is_reliable: bool = True  # or compression has left too little of the photographs to tell it
 
 
@@ -123,10 +118,14 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     in_focus = _likeliest(bent or plain)
     sds = [fit.sd for fit in fits]  # the same for all that is compared
     kurtosis = 0.0 if in_focus is None else _learned_kurtosis(in_focus, sds)
-    edge_doubt = _OF_UNKNOWN_CURVE if tone is Tone.UNKNOWN else 0.0
-    is_compressed = _are_compressed(fits)
+    camera = CameraTone(
+        tone,
+        kurtosis=kurtosis,
+        is_curve_unknown=tone is Tone.UNKNOWN,
+        is_compressed=_are_compressed(fits),
+    )
     if tone is Tone.LINEAR:
-        return CameraTone(tone, kurtosis=kurtosis, is_compressed=is_compressed)
+        return camera
     if kurtosis:
         fits = [_with_kurtosis(fit, kurtosis) for fit in fits]
         plain, bent = _by_curves(fits, tone)
@@ -137,13 +136,7 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
         ]
     )
     if best is None:
-        return CameraTone(
-            tone,
-            SHARPENING_PX,
-            kurtosis=kurtosis,
-            edge_doubt=edge_doubt,
-            is_compressed=is_compressed,
-        )
+        return replace(camera, sharpening_px=SHARPENING_PX)
     base = _BENT.get(min(plain, key=lambda joint: joint.loss).tone) if plain else None
     start = next((joint for joint in bent if joint.tone is base), None)
     is_reliable = True
@@ -153,19 +146,17 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
         is_reliable = best.is_settled and not _are_coarse(steps)
     blur_px = float(np.median([fit.state.blur.mean_sd_px for fit in best.fits]))
     known = _known_by(best)
-    if tone is Tone.UNKNOWN and not best.tone.is_shaped and _are_burnt(fits):
-        # its upper end is not seen: what it may be off stays in the covariances
+    if camera.is_curve_unknown and not best.tone.is_shaped and _are_burnt(fits):
+        # the curve's upper end is not seen: what it may be off stays in the covariances
         known = _slightly_bent(known)
         best = replace(best, tone=_BENT[best.tone])
-    return CameraTone(
-        best.tone,
-        best.sharpening_px,
-        known,
-        blur_px,
-        kurtosis,
-        edge_doubt,
-        is_compressed,
-        is_reliable,
+    return replace(
+        camera,
+        tone=best.tone,
+        sharpening_px=best.sharpening_px,
+        known=known,
+        blur_px=blur_px,
+        is_reliable=is_reliable,
     )
 
 
@@ -177,7 +168,7 @@ def unknowns_of_disc(task: DiscTask, camera: CameraTone) -> DiscUnknowns:
         sharpening_px=camera.sharpening_px,
         has_ink_slope=not camera.tone.is_shaped and task.radius_px >= _LARGE_RADIUS_PX,
         kurtosis=camera.kurtosis,
-        edge_doubt=camera.edge_doubt,
+        is_curve_unknown=camera.is_curve_unknown,
         is_compressed=camera.is_compressed,
     )
 

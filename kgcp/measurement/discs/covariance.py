@@ -39,14 +39,17 @@ _ARC_VARIANCE, _BLOCK_VARIANCE, _PIXEL_VARIANCE = 2.0, 1.5, 2.5
 _FLOOR_PX = 0.0002
 _COMMON_SHARE = 0.25  # where edges scatter more than noise makes them, so much of it, …
 _EXTRAPOLATED_SHARE = 0.025  # … and so much of how far they are beyond what is not clipped
-# Of the blur: compression displaces all edges alike. Where σ is 0.67 px, quality 92 and 85 do it by
-# 0.02 to 0.06 px, and where white is burnt by 0.05 and 0.18 px (`benchmarks.calibrate.operator`,
-# cases `srgb_jpeg` and `clipped_jpeg`). A curve that could bend in each disc would take it up
+# By how much of the blur the camera may displace all edges alike, as standard deviations, from the
+# cases named of `benchmarks.calibrate.operator`. An unknown curve that three parameters do not hold
+# does it by 0.05 to 0.13 px where σ is 0.67 px (`unknown_film`). If discs are too few to show that
+# a curve is bent, it is known no better.
+_OF_UNKNOWN_CURVE = 0.15
+# Compression of quality 92 and 85 does it by 0.02 to 0.06 px, and where white is burnt by 0.05 and
+# 0.18 px (`srgb_jpeg`, `clipped_jpeg`). A curve that could bend in each disc would take it up
 # instead, and displace centres where the light falls off: by 0.005 px at R 150 px, 1.9 deviations.
 _OF_COMPRESSION, _OF_COMPRESSION_OF_BURNT = 0.08, 0.3
-# Of the blur, too: out of focus, the point spread has more to it than a kurtosis. The half of an
-# edge that is not burnt shows it as a displacement of 0.035 to 0.08 px (σ 1.2 px, the same
-# benchmark, case `defocused_clipped`).
+# Out of focus, the point spread has more to it than a kurtosis. The half of an edge that is not
+# burnt shows it as a displacement of 0.035 to 0.08 px where σ is 1.2 px (`defocused_clipped`).
 _OUT_OF_FOCUS_AND_BURNT = 0.04
 # Of what compression or an unknown tone curve may displace all edges by, so much is left of a ring
 # that is measured as a whole, whose edges tell it: of the 0.1 px of a bent curve 0.007 px, where a
@@ -260,6 +263,7 @@ def _of_camera_px(fit: DiscFit) -> float:
     differ. Where all is burnt, clipped values that are smeared show that there was compression.
     """
     free, limits = fit.free, fit.sample.censoring
+    of_curve = _OF_UNKNOWN_CURVE if free.is_curve_unknown else 0.0
     of_compression = of_focus = 0.0
     if fit.sample.is_burnt:
         of_focus = _OUT_OF_FOCUS_AND_BURNT if free.kurtosis else 0.0
@@ -267,8 +271,7 @@ def _of_camera_px(fit: DiscFit) -> float:
         of_compression = _OF_COMPRESSION_OF_BURNT * (free.is_compressed or is_smeared)
     elif free.tone is not Tone.LINEAR:
         of_compression = _OF_COMPRESSION * free.is_compressed
-    doubt = math.hypot(free.edge_doubt, of_compression, of_focus)
-    return doubt * fit.state.blur.mean_sd_px
+    return math.hypot(of_curve, of_compression, of_focus) * fit.state.blur.mean_sd_px
 
 
 def _edges_tell_displacement(fit: DiscFit) -> bool:

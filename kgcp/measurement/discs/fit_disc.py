@@ -105,8 +105,7 @@ class DiscUnknowns:
     precision: FloatArray  # (21, 21); zeros: nothing is known
     is_tone_stated: bool  # or it is one to start from
     kurtosis: float = 0.0  # excess of the point spread's, which is known
-    # by how much of the blur the curve may displace all edges alike, as standard deviation
-    edge_doubt: float = 0.0
+    is_curve_unknown: bool = False  # what is known of it is learned from discs, or from none
     is_compressed: bool = False  # the photograph
 
     @classmethod
@@ -119,7 +118,7 @@ class DiscUnknowns:
         has_ink_slope: bool = False,
         is_tone_stated: bool = True,
         kurtosis: float = 0.0,
-        edge_doubt: float = 0.0,
+        is_curve_unknown: bool = False,
         is_compressed: bool = False,
     ) -> DiscUnknowns:
         """Return the unknowns of a disc.
@@ -136,8 +135,8 @@ class DiscUnknowns:
             Whether the tone is the camera's, or one to start from.
         kurtosis : float
             Excess of that of the camera's point spread.
-        edge_doubt : float
-            By how much of the blur the curve may displace all edges alike, as standard deviation.
+        is_curve_unknown : bool
+            Whether the tone is learned from discs.
         is_compressed : bool
             Whether the photograph is a JPEG, or was one.
         """
@@ -164,7 +163,7 @@ class DiscUnknowns:
             precision,
             is_tone_stated,
             kurtosis,
-            edge_doubt,
+            is_curve_unknown,
             is_compressed,
         )
 

@@ -128,21 +128,21 @@ def test_no_pixels_are_not_burnt() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sensor", "response", "quality", "doubt"),
+    ("sensor", "response", "quality"),
     [
-        (Sensor(), Response.LINEAR, 0, 0.0),
-        (Sensor(), Response.LINEAR, 85, 0.0),
-        (Sensor(tone=ToneCurve.SRGB), Response.SRGB, 0, 0.0),
-        (Sensor(tone=ToneCurve.SRGB), Response.SRGB, 85, 0.0),
-        (Sensor(), Response.UNKNOWN, 0, 0.15),
-        (Sensor(tone=ToneCurve.FILM), Response.UNKNOWN, 0, 0.15),
+        (Sensor(), Response.LINEAR, 0),
+        (Sensor(), Response.LINEAR, 85),
+        (Sensor(tone=ToneCurve.SRGB), Response.SRGB, 0),
+        (Sensor(tone=ToneCurve.SRGB), Response.SRGB, 85),
+        (Sensor(), Response.UNKNOWN, 0),
+        (Sensor(tone=ToneCurve.FILM), Response.UNKNOWN, 92),
     ],
 )
-def test_edges_are_doubtful_by_curves_that_are_not_known_and_by_compression(
-    sensor: Sensor, response: Response, quality: int, doubt: float
+def test_what_displaces_edges_is_known_of_the_camera(
+    sensor: Sensor, response: Response, quality: int
 ) -> None:
     learned = learn_tone(small_discs(sensor, (0.62, 0.1), 0.004, 0, quality), response)
-    assert learned.edge_doubt == doubt
+    assert learned.is_curve_unknown == (response is Response.UNKNOWN)
     assert learned.is_compressed == (quality > 0)
 
 
