@@ -61,6 +61,13 @@ PRESET_NAMES = (
     help="Simulate errors of trajectory, lever arm, frame times and reference poses.",
 )
 @click.option(
+    "--gain",
+    type=(click.FloatRange(0.01, 100.0), click.FloatRange(0.01, 100.0)),
+    metavar="MIN MAX",
+    help="Range of the exposure; at 1, a perfectly white plate reaches full scale, and beyond it is"
+    " burnt.",
+)
+@click.option(
     "--shadow",
     type=click.FloatRange(0.0, 1.0),
     help="Cast a shadow edge across the plates; this share of the light is left in it.",
@@ -145,7 +152,7 @@ def command(
 
     A vehicle with the target on its roof drives round a ring road; a UAV climbs and descends
     above it. Writes frames, flight.toml, frames.csv, vehicle.csv, reference.csv and truth.csv.
-    Options from --shadow to --motion add an effect to the preset, or change the preset's own.
+    Options from --gain to --motion add an effect to the preset, or change the preset's own.
 
     With --field, writes photographs of a field of discs by the preset's camera, with field.toml
     and the truth, to test 'kgcp calibrate'.

@@ -1,7 +1,7 @@
 """A number or two for each effect of real light: how strong it is in a simulated flight.
 
 Without the effect they are neutral: 1 for the share of the light that is left and for the ratio of
-the astigmatism, 0 for all others.
+the astigmatism, 0 for all others. The exposure is never without effect.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ _LEAST_PEAK = 1.0 / 3.0  # of the largest peak of highlights
 class Effects:
     """Strength of each effect."""
 
+    # range of the exposure, relative to the one at which radiance 1 fills the well
+    gain: tuple[float, float] = (0.7, 1.0)
     shadow: float = 1.0  # share of the light that is left behind a shadow edge; 1: no edge
     stripes: int = 0  # number of stripe-shaped shadows
     dirt: float = 0.0  # relative standard deviation of the reflectance
@@ -43,6 +45,7 @@ class Effects:
         dirt = settings.dirt or Dirt(sd=0.0, stains=0)
         lens = settings.lens or Aberration()
         return cls(
+            gain=settings.gain,
             shadow=shadow.light_left if shadow.edges else 1.0,
             stripes=shadow.stripes,
             dirt=dirt.sd,
@@ -70,6 +73,7 @@ def with_effects(settings: SimulationSettings, wanted: Effects) -> SimulationSet
     effect, as it is by default.
     """
     had = Effects.of(settings)
+    settings = replace(settings, gain=wanted.gain)
     if (wanted.shadow, wanted.stripes) != (had.shadow, had.stripes):
         settings = replace(settings, shadow=_shadow(settings.shadow, wanted))
     if (wanted.dirt, wanted.stains) != (had.dirt, had.stains):

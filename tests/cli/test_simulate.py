@@ -47,6 +47,15 @@ def test_wrong_options_are_usage_errors(tmp_path: Path, option: list[str]) -> No
     assert result.exit_code == 2
 
 
+def test_a_range_that_is_turned_round_ends_in_one_line(tmp_path: Path) -> None:
+    arguments = ["simulate", str(tmp_path / "flight"), "--gain", "2", "1", "--frames", "1"]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 1
+    assert "gain: 1 is out of range" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert not (tmp_path / "flight").exists()
+
+
 def test_a_used_folder_ends_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("")
     result = CliRunner().invoke(main, ["simulate", str(tmp_path), "--frames", "1", "--jobs", "1"])
@@ -55,6 +64,7 @@ def test_a_used_folder_ends_in_one_line(tmp_path: Path) -> None:
 
 
 EFFECTS: dict[str, Any] = {
+    "gain": (1.2, 2.0),
     "shadow": 0.6,
     "stripes": 2,
     "dirt": 0.03,
@@ -93,7 +103,8 @@ def test_a_camera_that_sharpens_is_not_stated_to_be_linear() -> None:
 def test_options_of_effects_reach_the_flight_and_its_readme(tmp_path: Path) -> None:
     out = tmp_path / "flight"
     options = [
-        *("--shadow", "0.6", "--stripes", "2", "--dirt", "0.03", "--stains", "4"),
+        *("--gain", "1.2", "2", "--shadow", "0.6", "--stripes", "2"),
+        *("--dirt", "0.03", "--stains", "4"),
         *("--glare", "0.3", "--astigmatism", "1.4", "--coma", "0.1"),
         *("--defocus", "1.5", "--sharpening", "0.7", "2", "--phone"),
         *("--rolling", "0.02", "--motion", "30", "-40"),
