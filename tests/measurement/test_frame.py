@@ -106,6 +106,34 @@ def test_sixteen_bits_measure_like_eight(
     assert deep.appearance.white == pytest.approx(shallow.appearance.white, abs=0.01)
 
 
+@pytest.mark.parametrize("radius_px", [14.0, 25.0, 60.0])
+def test_a_sensor_that_saturates_below_its_files_range_measures_like_any_other(
+    target: Target,
+    camera: Camera,
+    place_plate: PlacePlate,
+    draw_frame: DrawFrame,
+    radius_px: float,
+) -> None:
+    """Twelve bits in files of sixteen: burnt plate is not mistaken for something else."""
+    pose = place_plate((240.0, 180.0), radius_px, tilt_deg=10.0)
+    burnt = draw_frame((target, pose), black=0.15, white=1.6, ground=0.5)
+    settings = DetectSettings()
+    usual, low = (
+        measure_frame(frame, camera, (target,), settings)[0]
+        for frame in (burnt, burnt.astype(np.uint16) * 16)
+    )
+    assert isinstance(usual, Measurement)
+    assert isinstance(low, Measurement)
+    assert usual.uncertainty is not None
+    assert low.uncertainty is not None
+    sd_m = usual.uncertainty.sd_distance_m
+    assert low.pose.distance_m == pytest.approx(usual.pose.distance_m, abs=0.1 * sd_m)
+    assert low.uncertainty.sd_distance_m == pytest.approx(sd_m, rel=0.1)
+    assert usual.appearance.white == 1.0
+    assert low.appearance.white == pytest.approx(16.0 * 255.0 / 65535.0)
+    assert low.appearance.saturated == pytest.approx(usual.appearance.saturated, abs=0.01)
+
+
 def test_two_plates_of_one_code_are_two_instances(
     target: Target, camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
 ) -> None:

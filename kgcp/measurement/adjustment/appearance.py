@@ -69,8 +69,7 @@ def places_across_edges_px(fit: TargetFit, level: float | None) -> FloatArray:
     there is one place; otherwise there is one for every pixel near an edge.
     """
     light, problem, field = fit.parameters.light, fit.sample.problem, fit.parameters.field
-    tone = problem.tone
-    high = problem.censoring.high if problem.burnt_white is None else problem.burnt_white
+    tone, high = problem.tone, problem.brightest
     if field is None:
         black, white = plateau_levels(light, tone)
         wanted = 0.5 * (black + min(white, high)) if level is None else level

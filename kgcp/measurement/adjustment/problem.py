@@ -58,7 +58,7 @@ class FitProblem:
     @property
     def brightest(self) -> float:
         """The grey value that burnt white is seen with."""
-        return 1.0 if self.burnt_white is None else self.burnt_white
+        return self.censoring.brightest if self.burnt_white is None else self.burnt_white
 
     def with_burnt_white(self, white: float, limit: float) -> FitProblem:
         """Return the problem with a burnt white below the end of the range.

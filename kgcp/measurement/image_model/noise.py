@@ -74,6 +74,7 @@ class Censoring:
     # where light is clipped before its noise comes, which is that of compression; infinite: after
     ceiling: float = math.inf
     floor: float = -math.inf
+    brightest: float = 1.0  # grey value that clipped white is seen with
 
     @property
     def is_clipped(self) -> BoolArray:
@@ -103,11 +104,12 @@ def find_censoring(levels: FloatArray, levels_per_count: float, width: int) -> C
     """
     high, low = 1.0 - 0.5 * levels_per_count, 0.5 * levels_per_count
     top, near_top, near_bottom = float(levels.max()), *_pixels_near_ends(levels, levels_per_count)
+    brightest = 1.0
     # a sensor of fewer bits than its files saturates below the end of the range
     if top < high:
         at_top = float(np.mean(levels == top))
         if at_top > _PILED_UP > float(np.mean(levels > _BELOW_TOP * top)) - at_top:
-            high = top - 0.5 * levels_per_count
+            high, brightest = top - 0.5 * levels_per_count, top
     of_top, of_bottom = (_smeared_over(number) for number in (near_top, near_bottom))
     if of_top and not _is_smeared_away(1.0 - levels, levels_per_count, width):
         of_top = 0
@@ -115,7 +117,7 @@ def find_censoring(levels: FloatArray, levels_per_count: float, width: int) -> C
         of_bottom = 0
     high, low = high - of_top * levels_per_count, low + of_bottom * levels_per_count
     ceiling, floor = 1.0 if of_top else math.inf, 0.0 if of_bottom else -math.inf
-    return Censoring(high, low, levels >= high, levels <= low, ceiling, floor)
+    return Censoring(high, low, levels >= high, levels <= low, ceiling, floor, brightest)
 
 
 @compiled
