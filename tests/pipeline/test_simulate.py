@@ -113,7 +113,17 @@ def test_truth_is_consistent(flight: tuple[FlightPlan, Path]) -> None:
 
 
 def test_any_number_of_processes_writes_the_same_bytes(tmp_path: Path) -> None:
-    effects = Effects(0.5, 1, 0.05, 3, 0.4, 1.3, 0.1, phone=True, rolling=0.02)
+    effects = Effects(
+        shadow=0.5,
+        stripes=1,
+        dirt=0.05,
+        stains=3,
+        glare=0.4,
+        astigmatism=1.3,
+        coma=0.1,
+        phone=True,
+        rolling=0.02,
+    )
     settings = with_effects(replace(SMALL, frames=2), effects)
     for jobs in (1, 2):
         write(settings, tmp_path / f"jobs_{jobs}", jobs)
