@@ -9,11 +9,14 @@ from enum import StrEnum
 
 import numpy as np
 
+from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.georef.local_frame import CrsTransform
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import NoPosition, TargetPosition, TargetPositions
+
+_SAME_PLACE = 1e-9  # relative: a millimetre or two of a northing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,7 +135,7 @@ def build_gcps(
     Raises
     ------
     KgcpError
-        As `TargetPositions.positions`.
+        As `TargetPositions.positions`, or if a static target has the id of a moving one's point.
     """
     first = [sighting for sighting in sightings if sighting.instance == 0]
     times = [sighting.row_time_s(camera) for sighting in first]
@@ -148,7 +151,9 @@ def build_gcps(
             placed.append((sighting, time_s, position))
         else:
             skipped.append(SkippedSighting(sighting.frame, sighting.target, position))
-    return _on_the_map(placed, target_positions), tuple(skipped)
+    gcps = _on_the_map(placed, target_positions)
+    check_ids(gcps)
+    return gcps, tuple(skipped)
 
 
 def _on_the_map(
@@ -194,6 +199,31 @@ def _gcp(
         score=sighting.score,
         ambiguity=sighting.ambiguity,
     )
+
+
+def check_ids(gcps: Sequence[Gcp]) -> None:
+    """Check that points of one id are one point.
+
+    Raises
+    ------
+    KgcpError
+        If two of them are at different places.
+    """
+    first: dict[str, Gcp] = {}
+    for point in gcps:
+        other = first.setdefault(point.id, point)
+        if np.allclose(point.position_map, other.position_map, rtol=_SAME_PLACE, atol=1e-9):
+            continue
+        where = f"in {other.frame} and {point.frame}"
+        if point.target != other.target:
+            raise KgcpError(
+                f"{point.id!r} is a static target and the point of a moving one {where};"
+                " give the static target another name in flight.toml"
+            )
+        raise KgcpError(
+            f"target {point.id!r} stands at different places {where};"
+            " give one of them another name, or correct position_m"
+        )
 
 
 def flight_prefix(name: str) -> str:

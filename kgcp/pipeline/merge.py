@@ -8,11 +8,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from kgcp.errors import KgcpError
 from kgcp.georef.camera_priors import CameraPrior
-from kgcp.georef.gcp import Gcp, SkippedSighting, flight_prefix, with_flight_name
+from kgcp.georef.gcp import (
+    Gcp,
+    SkippedSighting,
+    check_ids,
+    flight_prefix,
+    with_flight_name,
+)
 from kgcp.io.exporters.formats import DEFAULT_FORMATS
 from kgcp.io.exporters.points import MapPoints
 from kgcp.io.exporters.weights import MARK_FLOOR_PX
@@ -23,8 +27,6 @@ from kgcp.pipeline.export import GcpSet, write_formats
 
 OF_ONE_CAMERA = frozenset({"itwin", "opensfm"})
 """Formats whose files hold the camera, or depend on its frames' size, and that need it."""
-
-_SAME_PLACE = 1e-9  # relative: a millimetre or two of a northing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,7 +66,7 @@ def merge_gcps(parts: Sequence[GcpSet]) -> MergedGcps:
         for part in parts
         for point in with_flight_name(part.gcps, part.flight.name)
     )
-    _check_static(gcps)
+    check_ids(gcps)
     return MergedGcps(
         tuple(parts),
         parts[0].crs,
@@ -104,17 +106,6 @@ def _check_crs(parts: Sequence[GcpSet]) -> None:
                 f"the flights {parts[0].flight.name!r} and {part.flight.name!r} have different CRS"
                 f" ({parts[0].crs} and {part.crs}); name the CRS of all points",
                 option="crs",
-            )
-
-
-def _check_static(gcps: Sequence[Gcp]) -> None:
-    first: dict[str, Gcp] = {}
-    for point in gcps:
-        other = first.setdefault(point.id, point)
-        if not np.allclose(point.position_map, other.position_map, rtol=_SAME_PLACE, atol=1e-9):
-            raise KgcpError(
-                f"target {point.id!r} stands at different places in {other.frame} and"
-                f" {point.frame}; give one of them another name, or correct position_m"
             )
 
 

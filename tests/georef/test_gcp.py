@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.georef.gcp import SkippedSighting, SkipReason, build_gcps
@@ -36,13 +37,14 @@ def _sighting(number: int, target: str, time_s: float | None, instance: int = 0)
     )
 
 
-def _whereabouts(settings: VehicleSettings) -> TargetPositions:
+def _whereabouts(settings: VehicleSettings, static: str = "G") -> TargetPositions:
     time_s = np.arange(0.0, 10.01, 0.1)
     position = np.array([430606.1, 4583523.0, 120.0]) + np.outer(time_s, [10.0, 0.0, 0.0])
     sd = np.full((len(time_s), 3), 0.02)
     trajectory = Trajectory(time_s, position, np.zeros_like(position), sd, None)
-    static = Target(_GROUND, position_m=_POSITION, sd_position_m=(0.01, 0.02, 0.03))
-    return TargetPositions.of("EPSG:25831", [Target(_RING), static], trajectory, settings)
+    ring, sd_position_m = replace(_GROUND, name=static), (0.01, 0.02, 0.03)
+    ground = Target(ring, position_m=_POSITION, sd_position_m=sd_position_m)
+    return TargetPositions.of("EPSG:25831", [Target(_RING), ground], trajectory, settings)
 
 
 def test_moving_points_are_named_by_frame_and_static_ones_by_target() -> None:
@@ -55,6 +57,15 @@ def test_moving_points_are_named_by_frame_and_static_ones_by_target() -> None:
         np.testing.assert_allclose(static.position_map, _POSITION, atol=1e-6)
         assert static.cov_m2 is not None
         np.testing.assert_allclose(np.sqrt(np.diag(static.cov_m2)), [0.01, 0.02, 0.03])
+
+
+def test_a_static_target_named_like_a_moving_point_is_refused() -> None:
+    """Packages would take both for one point."""
+    whereabouts = _whereabouts(VehicleSettings(), static="K0003")
+    with pytest.raises(KgcpError, match=r"^'K0003' is a static target and the point of a moving"):
+        build_gcps([_sighting(3, "A", 1.0), _sighting(7, "K0003", None)], whereabouts, _CAMERA)
+    gcps, _ = build_gcps([_sighting(4, "A", 1.0), _sighting(7, "K0003", 1.0)], whereabouts, _CAMERA)
+    assert [point.id for point in gcps] == ["K0004", "K0003"]
 
 
 def test_covariance_is_given_along_the_maps_axes() -> None:
