@@ -249,14 +249,18 @@ def _static_positions(
 def static_position(
     position_map: tuple[float, float, float], target: AnyTarget, local_frame: LocalFrame
 ) -> TargetPosition:
-    """Return the place of the centre of a target's face, from its stated position."""
+    """Return the place of the centre of a target's face, from its stated position.
+
+    Its covariance is not known if no standard deviation is stated.
+    """
     position = local_frame.enu_from_map(np.array([position_map]))[0]
     axes = local_frame.grid_rotation(position)
     cov = covariance_along(axes, np.array(target.sd_position_m))
+    is_cov_known = any(target.sd_position_m)
     if isinstance(target, PlainTarget) and target.thickness_m and target.normal_enu is not None:
         level = local_frame.level_rotations(position[None])[0]
         normal = level @ np.array(target.normal_enu)
         aside_m = target.thickness_m * math.radians(target.sd_normal_deg)
         position = position + target.thickness_m * normal
         cov = cov + aside_m**2 * (np.eye(3) - np.outer(normal, normal))
-    return TargetPosition(position, cov)
+    return TargetPosition(position, cov if is_cov_known else None)

@@ -154,6 +154,12 @@ def test_a_static_target_needs_neither_vehicle_nor_time() -> None:
     )
 
 
+def test_a_static_target_of_unknown_accuracy_is_not_taken_for_exact() -> None:
+    target = Target(_RING, position_m=(430610.0, 4583523.0, 121.0))
+    target_positions = TargetPositions.of(_CRS, [target], None, VehicleSettings())
+    assert _only_place(target_positions.positions(["A"], [None])).cov_m2 is None
+
+
 def test_single_frames_outside_the_trajectory_are_named_not_placed() -> None:
     target_positions = TargetPositions.of(_CRS, [Target(_RING)], _straight(0.0), _LEVER)
     positions = target_positions.positions(["A"] * 4, [-1.0, None, 5.0, 11.0])

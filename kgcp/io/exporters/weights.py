@@ -1,4 +1,4 @@
-"""Accuracies that an adjustment can use: floors for marks, common errors for distances.
+"""Accuracies that an adjustment can use: floors for points and marks, common distance errors.
 
 A ring of 50 px is measured to a thousandth of a pixel. No calibration is that good all over the
 image: a mark with such a weight would have that of ten thousand tie points and bend the block
@@ -14,10 +14,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.gcp import Gcp
 
 MARK_FLOOR_PX = 0.1
 """Default of the least standard deviation of a mark [px]: what good calibrations leave."""
+
+POINT_FLOOR_M = 0.001
+"""Least standard deviation of a point [m]: no survey is better, and zeros mean infinite weight."""
 
 ASSUMED_SHARE = 3e-4
 """Standard deviation of all distances together, relative, where flight.toml states none."""
@@ -43,11 +47,22 @@ def with_floors(gcps: Sequence[Gcp], mark_floor_px: float) -> tuple[Gcp, ...]:
 
 
 def _with_floors(point: Gcp, mark_floor_px: float) -> Gcp:
-    cov, sd_m = point.centre_cov_px2, point.sd_distance_m
-    if cov is not None:
-        variances, axes = np.linalg.eigh(cov)
-        if variances[0] < mark_floor_px**2:
-            cov = (axes * np.maximum(variances, mark_floor_px**2)) @ axes.T
+    sd_m = point.sd_distance_m
     if sd_m is not None:
         sd_m = math.hypot(sd_m, distance_share(point) * point.distance_m)
-    return replace(point, centre_cov_px2=cov, sd_distance_m=sd_m)
+    return replace(
+        point,
+        cov_m2=_at_least(point.cov_m2, POINT_FLOOR_M),
+        centre_cov_px2=_at_least(point.centre_cov_px2, mark_floor_px),
+        sd_distance_m=sd_m,
+    )
+
+
+def _at_least(cov: FloatArray | None, floor: float) -> FloatArray | None:
+    """Return a covariance with a least standard deviation in every direction."""
+    if cov is None:
+        return None
+    variances, axes = np.linalg.eigh(cov)
+    if variances[0] >= floor**2:
+        return cov
+    return np.asarray((axes * np.maximum(variances, floor**2)) @ axes.T)

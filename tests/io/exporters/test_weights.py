@@ -18,7 +18,12 @@ from hypothesis import strategies as st
 
 from kgcp.georef.gcp import Gcp
 from kgcp.io.exporters.points import MapPoints
-from kgcp.io.exporters.weights import ASSUMED_SHARE, distance_share, with_floors
+from kgcp.io.exporters.weights import (
+    ASSUMED_SHARE,
+    POINT_FLOOR_M,
+    distance_share,
+    with_floors,
+)
 from kgcp.io.exporters.write import export
 
 Factory = Callable[..., MapPoints]
@@ -67,8 +72,18 @@ def test_a_distance_has_the_share_of_calibration_and_print() -> None:
     assert distance_share(point(sd_common_distance_m=0.016)) == pytest.approx(0.0002)
 
 
+def test_no_point_has_an_infinite_weight() -> None:
+    """Zeros are what some programs write for deviations that they do not know."""
+    exact, known = np.zeros((3, 3)), np.diag([0.01, 0.02, 0.03]) ** 2
+    floored, kept = with_floors((point(cov_m2=exact), point(cov_m2=known)), 0.1)
+    assert floored.cov_m2 is not None
+    np.testing.assert_allclose(floored.cov_m2, POINT_FLOOR_M**2 * np.eye(3))
+    assert kept.cov_m2 is known
+
+
 def test_what_is_unknown_stays_unknown() -> None:
     (floored,) = with_floors((point(centre_cov_px2=None, sd_distance_m=None),), 0.1)
+    assert floored.cov_m2 is None
     assert floored.centre_cov_px2 is None
     assert floored.sd_distance_m is None
 
