@@ -7,8 +7,8 @@ from itertools import combinations
 
 from kgcp.errors import KgcpError
 from kgcp.georef.camera_priors import opk_covs, opk_deg
-from kgcp.io.exporters.points import DEGREE_DECIMALS, MapPoints, covariance_cells, decimals
-from kgcp.io.files.csv_text import csv_text
+from kgcp.io.exporters.points import MapPoints, covariance_cells, decimals
+from kgcp.io.files.csv_text import DEGREE_DECIMALS, csv_text
 
 _PARAMETERS = ("x", "y", "z", "omega_deg", "phi_deg", "kappa_deg")
 COLUMNS = (

@@ -47,9 +47,12 @@ def files(points: MapPoints) -> Mapping[str, str]:
     Raises
     ------
     KgcpError
-        If there is no prior with a covariance, or an image's path has white space or a comma.
+        If there is no prior with a covariance, or an image's path has white space, a
+        comma or a quote.
     """
-    names = image_names((prior.frame for prior in points.priors), _FOLDER, r"\s,", keep_folder=True)
+    names = image_names(
+        (prior.frame for prior in points.priors), _FOLDER, r'\s,"', keep_folder=True
+    )
     table, reference = [_COLUMNS], []
     for prior, position, axes in zip(points.priors, *local_cameras(points), strict=True):
         if prior.cov is None:

@@ -86,4 +86,7 @@ FORMATS: Mapping[str, Format] = {
 }
 """By the name on the command line."""
 
+OF_CAMERAS = frozenset({"colmap", "camera-priors"})
+"""Formats that hold positions of the camera and no points."""
+
 DEFAULT_FORMATS = ("csv", "odm")

@@ -15,8 +15,8 @@ from pyproj import CRS
 from pyproj.enums import WktVersion
 
 from kgcp.georef.gcp import Gcp
-from kgcp.io.exporters.points import MapPoints
-from kgcp.io.exporters.shared import ATTRIBUTES, attributes
+from kgcp.io.exporters.points import CERTAIN, MapPoints
+from kgcp.io.exporters.shared import ATTRIBUTES, attributes, well_known_text
 
 _TABLE = "kgcps"
 _APPLICATION_ID, _USER_VERSION = 0x47504B47, 10400  # "GPKG", 1.4.0
@@ -56,8 +56,7 @@ def files(points: MapPoints) -> Mapping[str, str | bytes]:
         connection.execute(f"PRAGMA application_id = {_APPLICATION_ID}")
         connection.execute(f"PRAGMA user_version = {_USER_VERSION}")
         connection.executescript(_SCHEMA)
-        crs = points.parsed_crs
-        srs_id = _add_systems(connection, points.crs, crs if crs.is_compound else crs.to_2d())
+        srs_id = _add_systems(connection, points)
         _add_layer(connection, points.gcps, srs_id)
         connection.commit()
         content = connection.serialize()
@@ -67,9 +66,10 @@ def files(points: MapPoints) -> Mapping[str, str | bytes]:
     return {"geopackage/kgcps.gpkg": content, "geopackage/HOWTO.txt": how_to}
 
 
-def _add_systems(connection: sqlite3.Connection, text: str, crs: CRS) -> int:
+def _add_systems(connection: sqlite3.Connection, points: MapPoints) -> int:
     """Add the three systems that every GeoPackage has and the map's; return the latter's id."""
-    authority = crs.to_authority()
+    crs = points.written_crs
+    authority = None if crs.is_bound else crs.to_authority(min_confidence=CERTAIN)
     wgs84 = CRS.from_epsg(4326).to_wkt(WktVersion.WKT1_GDAL)
     rows: dict[int, tuple[str | int | None, ...]] = {
         -1: ("Undefined Cartesian SRS", -1, "NONE", -1, "undefined", None),
@@ -80,8 +80,8 @@ def _add_systems(connection: sqlite3.Connection, text: str, crs: CRS) -> int:
         srs_id, organization = int(authority[1]), authority[0]
     else:
         srs_id, organization = _OWN_SRS, "NONE"
-    definition = crs.to_wkt(WktVersion.WKT1_GDAL, pretty=False)
-    rows.setdefault(srs_id, (crs.name, srs_id, organization, srs_id, definition, text))
+    definition = well_known_text(points, "geopackage", "GeoPackage")
+    rows.setdefault(srs_id, (crs.name, srs_id, organization, srs_id, definition, points.crs))
     connection.executemany(
         "INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, ?)", rows.values()
     )

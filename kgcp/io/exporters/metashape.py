@@ -126,8 +126,7 @@ def _script(points: MapPoints, mark_px: str) -> str:
 
 def _definition(points: MapPoints) -> str:
     """Return a CRS as Metashape's CoordinateSystem takes it: a code, or well-known text 1."""
-    crs = points.parsed_crs
-    code = None if crs.is_compound else crs.to_2d().to_epsg()
+    code = None if points.written_crs.is_compound else points.horizontal_epsg
     return well_known_text(points, _FOLDER, "Metashape") if code is None else f"EPSG::{code}"
 
 

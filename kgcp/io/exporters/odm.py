@@ -34,7 +34,7 @@ from kgcp.io.exporters.points import (
 
 _FOLDER = "odm"
 _LIST = "gcp_list.txt"
-_WGS84_UTM = re.compile(r"32([67])(\d\d)")
+_WGS84_UTM = re.compile(r"32([67])(0[1-9]|[1-5]\d|60)")
 _NOTE = """\
 # x (easting or longitude), y, height [m], pixel x, y, image, point
 # from kgcp: each moving point is seen in one image only; run ODM with --force-gps"""
@@ -84,7 +84,7 @@ def _gcp_list(points: MapPoints) -> str:
     names = image_names((point.frame for point in points.gcps), _LIST, r"\s")
     label = labels(points.gcps, _LIST)
     height_factor = _metres_per_height_unit(points.parsed_crs)
-    lines = [_header(points.crs, points.parsed_crs), _NOTE]
+    lines = [_header(points), _NOTE]
     owners: dict[tuple[str, str, str], str] = {}
     for point in points.controls:
         xyz = points.xyz(point.position_map, height_factor=height_factor)
@@ -98,7 +98,7 @@ def _gcp_list(points: MapPoints) -> str:
 def _geo(points: MapPoints) -> str:
     names = image_names((prior.frame for prior in points.priors), "geo.txt", r"\s")
     height_factor = _metres_per_height_unit(points.parsed_crs)
-    lines = [_header(points.crs, points.parsed_crs)]
+    lines = [_header(points)]
     for prior, angles in zip(points.priors, _yaw_pitch_roll_deg(points), strict=True):
         xyz = points.xyz(prior.position_map, height_factor=height_factor)
         cells = (names[prior.frame], *xyz, *map(decimals, angles), *_accuracies(prior))
@@ -127,15 +127,14 @@ def _yaw_pitch_roll_deg(points: MapPoints) -> FloatArray:
     return angles
 
 
-def _header(text: str, crs: CRS) -> str:
+def _header(points: MapPoints) -> str:
     """Return the first line; `WGS84 UTM` where it applies, since no reader mistakes its axes."""
-    horizontal = crs.sub_crs_list[0] if crs.is_compound else crs.to_2d()
-    code = horizontal.to_epsg()
+    code = points.horizontal_epsg
     if code is None:
-        if "+proj" in text:
-            return text
+        if "+proj" in points.crs:
+            return points.crs
         raise KgcpError(
-            f"{_LIST}: crs {text!r} has no EPSG code, which ODM needs;"
+            f"{_LIST}: crs {points.crs!r} has no EPSG code, which ODM needs;"
             " give crs in flight.toml as 'EPSG:code' or a PROJ string, or leave out the format odm"
         )
     utm = _WGS84_UTM.fullmatch(str(code))

@@ -128,7 +128,8 @@ def _definition(points: MapPoints) -> str:
     is_plain = crs.is_geographic or crs.axis_info[0].unit_conversion_factor == 1.0
     if _CODE.fullmatch(points.crs) and (crs.is_compound or is_plain):
         return points.crs
-    whole = crs if crs.is_compound else crs.to_3d()
+    written = points.written_crs
+    whole = written if written.is_compound else written.to_3d()
     return whole.to_wkt(WktVersion.WKT2_2019)
 
 
@@ -161,10 +162,13 @@ def _scene_reference_frame(points: MapPoints) -> dict[str, object]:
 
 def _is_left_handed(points: MapPoints) -> bool:
     """Whether the CRS's first two axes and up are left-handed, as north, east, up are."""
+    first, second = points.parsed_crs.axis_info[:2]
+    if first.direction == second.direction:  # about a pole
+        return points.is_north_first
     east_north = {"east": (1, 0), "west": (-1, 0), "north": (0, 1), "south": (0, -1)}
     (a, b), (c, d) = (
         east_north.get(axis.direction, default)
-        for axis, default in zip(points.parsed_crs.axis_info[:2], ((1, 0), (0, 1)), strict=True)
+        for axis, default in zip((first, second), ((1, 0), (0, 1)), strict=True)
     )
     return a * d - b * c < 0
 

@@ -73,11 +73,12 @@ def files(points: MapPoints) -> Mapping[str, str]:
 
 def _points(points: MapPoints, gcps: Iterable[Gcp]) -> str:
     label = labels(points.gcps, _FOLDER)
-    lines = []
-    for point_id, group in by_id(gcps).items():
+    lines, groups = [], by_id(gcps)
+    covs = [group[0].cov_m2 for group in groups.values()]
+    is_each_known = all(cov is not None for cov in covs)  # lines of one file are alike
+    for (point_id, group), cov in zip(groups.items(), covs, strict=True):
         cells = [label[point_id], *points.own_axes(points.xyz(group[0].position_map))]
-        cov = group[0].cov_m2
-        if cov is not None:
+        if cov is not None and is_each_known:
             accuracies = largest_sd(cov[:2, :2]), float(deviations(cov)[2])
             cells += map(decimals, accuracies)
         lines.append(",".join(cells) + "\n")

@@ -20,12 +20,15 @@ from kgcp.georef.camera_priors import CameraPrior
 from kgcp.georef.crs import is_geographic
 from kgcp.georef.gcp import Gcp
 from kgcp.io.exporters.weights import MARK_FLOOR_PX
+from kgcp.io.files.csv_text import DEGREE_DECIMALS
 
 Cell = TypeVar("Cell", str, float)
 
 METRE_DECIMALS = 7  # points that differ never look the same
-DEGREE_DECIMALS = 12
 PIXEL_DECIMALS = 7
+
+CERTAIN = 100
+"""Confidence that a CRS is the one of a code; PROJ's usual 70 guesses a datum from an ellipsoid."""
 
 CORNER_PX = 0.5
 """Added to pixel coordinates for formats whose (0, 0) is the corner of the top-left pixel."""
@@ -47,8 +50,21 @@ class MapPoints:
 
     @property
     def parsed_crs(self) -> CRS:
-        """The CRS of the coordinates."""
-        return _parsed(self.crs)
+        """The CRS of the coordinates, without its way to WGS 84: that does not concern axes."""
+        return _without_datum_shift(self.crs)
+
+    @property
+    def written_crs(self) -> CRS:
+        """The CRS as files state it: with its way to WGS 84, and two axes unless it is compound."""
+        crs = _parsed(self.crs)
+        return crs if crs.is_compound or crs.is_bound else crs.to_2d()
+
+    @property
+    def horizontal_epsg(self) -> int | None:
+        """The EPSG code of the horizontal part; None if there is none for exactly that CRS."""
+        crs = self.written_crs
+        horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
+        return None if horizontal.is_bound else horizontal.to_epsg(min_confidence=CERTAIN)
 
     @property
     def heights(self) -> str:
@@ -91,8 +107,12 @@ class MapPoints:
 
 @lru_cache(maxsize=8)
 def _parsed(crs: str) -> CRS:
-    """Parse a CRS without its way to WGS 84, which does not concern its axes."""
-    parsed = CRS.from_user_input(crs)
+    return CRS.from_user_input(crs)
+
+
+@lru_cache(maxsize=8)
+def _without_datum_shift(crs: str) -> CRS:
+    parsed = _parsed(crs)
     while parsed.is_bound and parsed.source_crs is not None:
         parsed = parsed.source_crs
     return parsed
@@ -100,8 +120,10 @@ def _parsed(crs: str) -> CRS:
 
 @lru_cache(maxsize=8)
 def _is_north_first(crs: str) -> bool:
-    first, second = (axis.direction for axis in _parsed(crs).axis_info[:2])
-    return first in {"north", "south"} and second in {"east", "west"}
+    first, second = _without_datum_shift(crs).axis_info[:2]
+    if first.direction == second.direction:  # about a pole, both axes point away from it, or to it
+        return first.name.startswith("Northing")
+    return first.direction in {"north", "south"} and second.direction in {"east", "west"}
 
 
 def decimals(value: float, places: int = 9) -> str:

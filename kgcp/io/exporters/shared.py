@@ -75,9 +75,8 @@ def well_known_text(points: MapPoints, where: str, program: str) -> str:
     KgcpError
         If the CRS has no such form.
     """
-    crs = points.parsed_crs
     try:
-        return (crs if crs.is_compound else crs.to_2d()).to_wkt(WktVersion.WKT1_GDAL)
+        return points.written_crs.to_wkt(WktVersion.WKT1_GDAL)
     except CRSError:
         raise KgcpError(
             f"{where}: crs {points.crs!r} has no form that {program} reads; export in another CRS"

@@ -6,6 +6,9 @@ import csv
 import io
 from collections.abc import Iterable, Sequence
 
+DEGREE_DECIMALS = 12
+"""Of geographic coordinates, by which 0.1 µm shows."""
+
 
 def csv_text(columns: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
     """Return a line with the columns' names and one for each row."""

@@ -11,7 +11,7 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, opk_from_rotation
 from kgcp.georef.local_frame import LocalFrame
-from kgcp.io.files.csv_text import csv_text
+from kgcp.io.files.csv_text import DEGREE_DECIMALS, csv_text
 from kgcp.io.tables.columns import (
     BOOLEAN,
     INTEGER,
@@ -27,7 +27,6 @@ from kgcp.network.ground.point_images import CameraPose
 
 _AXES = "xyz"
 _ANGLES = ("omega_deg", "phi_deg", "kappa_deg")
-_DEGREES_DECIMALS = 12  # of geographic coordinates, by which 0.1 µm shows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,7 +163,7 @@ def pose_csv_cells(
     cov : (6, 6) array
         Of position [m] and rotation vector [rad].
     """
-    decimals = _DEGREES_DECIMALS if is_geographic else 6
+    decimals = DEGREE_DECIMALS if is_geographic else 6
     x, y, z = position.tolist()
     return [
         frame,

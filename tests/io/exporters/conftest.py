@@ -29,6 +29,11 @@ CAMERA = Camera(
     p1=0.001,
     p2=-0.0005,
 )
+# Of a user's own datum: kgcp must not take it for that of a code with the same ellipsoid.
+OWN_DATUM = (
+    "+proj=tmerc +lat_0=0 +lon_0=12 +x_0=4500000 +ellps=bessel"
+    " +towgs84=598.1,73.7,418.2,0.202,0.045,-2.455,6.7 +units=m +type=crs"
+)
 START = np.array([430606.1234567, 4583523.7654321, 122.3456789])
 COV = np.array([[4.0, 1.0, -0.5], [1.0, 9.0, 0.7], [-0.5, 0.7, 16.0]]) * 1e-4
 COV_PX = np.array([[9.0, 2.0], [2.0, 4.0]]) * 1e-4

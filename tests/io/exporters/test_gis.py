@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import sqlite3
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +12,11 @@ import numpy as np
 import pytest
 from pyproj import CRS, Transformer
 
+from kgcp.errors import KgcpError
 from kgcp.io.exporters import geojson, geopackage
 from kgcp.io.exporters.points import MapPoints
 from kgcp.io.exporters.write import export
+from tests.io.exporters.conftest import OWN_DATUM
 
 
 def test_gdal_reads_the_geopackage(points: MapPoints, tmp_path: Path) -> None:
@@ -39,6 +43,7 @@ def test_gdal_reads_the_geopackage(points: MapPoints, tmp_path: Path) -> None:
         "EPSG:4979",
         "EPSG:2263+6360",
         "+proj=tmerc +lat_0=41 +lon_0=2 +ellps=GRS80 +type=crs",
+        "+proj=tmerc +lat_0=0 +lon_0=12 +x_0=4500000 +ellps=bessel +type=crs",
     ],
 )
 def test_the_geopackage_has_any_crs(in_degrees: MapPoints, tmp_path: Path, crs: str) -> None:
@@ -50,6 +55,25 @@ def test_the_geopackage_has_any_crs(in_degrees: MapPoints, tmp_path: Path, crs: 
     assert got.equals(wanted if wanted.is_compound else wanted.to_2d(), ignore_axis_order=True)
     assert information["geometry_type"] == "Point Z"
     np.testing.assert_allclose(information["total_bounds"][0], 2.1701234567, atol=1e-9)
+
+
+def test_the_geopackage_keeps_the_datum_of_a_proj_string(
+    in_degrees: MapPoints, tmp_path: Path
+) -> None:
+    export(replace(in_degrees, crs=OWN_DATUM), "geopackage", tmp_path)
+    with contextlib.closing(sqlite3.connect(tmp_path / "geopackage" / "kgcps.gpkg")) as package:
+        (row,) = package.execute(
+            "SELECT organization, definition FROM gpkg_spatial_ref_sys WHERE srs_id > 4326"
+        )
+    assert row[0] == "NONE"
+    assert "TOWGS84[598.1,73.7,418.2,0.202,0.045,-2.455,6.7]" in row[1]
+
+
+def test_a_crs_without_well_known_text_1_is_one_line(points: MapPoints, tmp_path: Path) -> None:
+    bogota = replace(points, crs="EPSG:6247", priors=())
+    with pytest.raises(KgcpError, match=r"^geopackage: crs 'EPSG:6247' has no form"):
+        export(bogota, "geopackage", tmp_path)
+    assert not list(tmp_path.rglob("*.gpkg"))
 
 
 def test_the_same_points_make_the_same_geopackage(points: MapPoints) -> None:

@@ -15,6 +15,7 @@ from kgcp.errors import KgcpError
 from kgcp.io.exporters import metashape, opensfm, opf, pix4d
 from kgcp.io.exporters.points import MapPoints
 from kgcp.io.exporters.write import export
+from tests.io.exporters.conftest import OWN_DATUM
 
 Factory = Callable[..., MapPoints]
 
@@ -49,11 +50,14 @@ def test_pix4d_points_and_marks(points: MapPoints) -> None:
     assert float(marks[0][4]) == pytest.approx(0.0312, abs=1e-4)
 
 
-@pytest.mark.parametrize(("crs", "tolerance"), [("EPSG:4326", 1e-11), ("EPSG:2180", 1e-6)])
+@pytest.mark.parametrize(
+    ("crs", "tolerance"),
+    [("EPSG:4326", 1e-11), ("EPSG:2180", 1e-6), ("EPSG:32661", 1e-6), ("EPSG:32761", 1e-6)],
+)
 def test_pix4d_and_opf_follow_the_axes_of_the_crs(
     in_degrees: MapPoints, crs: str, tolerance: float
 ) -> None:
-    """EPSG defines 4326 as latitude, longitude and 2180 as northing, easting."""
+    """EPSG defines 4326 as latitude, longitude and the others as northing, easting."""
     points = replace(in_degrees, crs=crs)
     x, y, z = points.gcps[0].position_map
     (row,) = [line.split(",") for line in pix4d.files(points)["pix4d/gcps.csv"].splitlines()]
@@ -62,6 +66,13 @@ def test_pix4d_and_opf_follow_the_axes_of_the_crs(
     assert gcp["geolocation"]["coordinates"] == [y, x, z]
     assert gcp["geolocation"]["sigmas"] == pytest.approx([0.03, 0.02, 0.04])
     assert "latitude or northing first" in " ".join(pix4d.files(points)["pix4d/HOWTO.txt"].split())
+
+
+def test_the_lines_of_pix4d_have_as_many_cells_each(points: MapPoints) -> None:
+    first, *others = points.gcps
+    mixed = replace(points, gcps=(replace(first, cov_m2=None), *others))
+    rows = pix4d.files(mixed)["pix4d/gcps.csv"].splitlines()
+    assert {len(row.split(",")) for row in rows} == {4}
 
 
 # --- OPF ---------------------------------------------------------------------------------------
@@ -94,7 +105,13 @@ def test_pyopf_reads_the_project(points: MapPoints, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("crs", "swaps", "unit_m"),
-    [("EPSG:25831", False, 1.0), ("EPSG:2180", True, 1.0), ("EPSG:2263", False, 1200 / 3937)],
+    [
+        ("EPSG:25831", False, 1.0),
+        ("EPSG:2180", True, 1.0),
+        ("EPSG:2263", False, 1200 / 3937),
+        ("EPSG:32661", True, 1.0),
+        ("EPSG:5041", False, 1.0),
+    ],
 )
 def test_the_scene_frame_brings_points_near_zero_in_right_handed_metres(
     points: MapPoints, tmp_path: Path, crs: str, unit_m: float, *, swaps: bool
@@ -119,6 +136,12 @@ def test_the_scene_frame_brings_points_near_zero_in_right_handed_metres(
         at_first = np.array(gcps[0].geolocation.coordinates) * step.scale
         offset = near - ((at_first[[1, 0, 2]] if swaps else at_first) + step.shift)
         np.testing.assert_allclose(offset, [east, north, up], atol=1e-6)
+
+
+def test_opf_keeps_the_datum_of_a_proj_string(points: MapPoints) -> None:
+    own = replace(points, crs=OWN_DATUM, priors=())
+    frame = json.loads(opf.files(own)["opf/scene_reference_frame.json"])
+    assert "598.1" in frame["crs"]["definition"]
 
 
 def test_points_in_degrees_have_no_scene_frame(

@@ -16,6 +16,7 @@ from kgcp.georef.camera_priors import opk_deg
 from kgcp.io.exporters import metashape
 from kgcp.io.exporters.points import MapPoints
 from kgcp.io.exporters.write import export
+from tests.io.exporters.conftest import OWN_DATUM
 from tests.io.exporters.metashape_stand_in import (
     OPK,
     YPR,
@@ -223,6 +224,7 @@ def test_the_stand_in_refuses_what_the_reference_does_not_have(
         ("EPSG:4979", "CRS = 'EPSG::4326'"),
         ("EPSG:25831+5773", "CRS = 'COMPD_CS["),
         ("+proj=tmerc +lat_0=41 +lon_0=2 +ellps=GRS80", "CRS = 'PROJCS["),
+        (OWN_DATUM, "TOWGS84[598.1,73.7,418.2,0.202,0.045,-2.455,6.7]"),
     ],
 )
 def test_the_script_knows_the_crs(points: MapPoints, crs: str, definition: str) -> None:

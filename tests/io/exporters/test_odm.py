@@ -10,6 +10,7 @@ import pytest
 from kgcp.errors import KgcpError
 from kgcp.io.exporters import odm
 from kgcp.io.exporters.points import MapPoints
+from tests.io.exporters.conftest import OWN_DATUM
 
 Factory = Callable[..., MapPoints]
 
@@ -74,6 +75,11 @@ def test_odm_gets_longitude_first_with_millimetre_digits(in_degrees: MapPoints) 
         ("EPSG:32731", "WGS84 UTM 31S"),
         ("EPSG:32609", "WGS84 UTM 9N"),
         ("+proj=tmerc +lat_0=41 +lon_0=2 +ellps=GRS80", None),
+        ("+proj=utm +zone=32 +ellps=GRS80 +towgs84=100,50,20", None),  # not ETRS89
+        ("+proj=utm +zone=32 +datum=WGS84", None),
+        (OWN_DATUM, None),
+        ("EPSG:32664", None),  # in feet, and no UTM zone 64
+        ("EPSG:32661", None),
     ],
 )
 def test_odm_headers(points: MapPoints, crs: str, header: str | None) -> None:
