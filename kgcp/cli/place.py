@@ -8,18 +8,21 @@ from typing import TYPE_CHECKING
 import click
 
 from kgcp.cli.options import detections_option, flight_place_argument, json_option, out_place_option
-from kgcp.io.exporters.formats import FORMATS
+from kgcp.io.exporters.formats import FORMATS, OF_CAMERAS
 
 if TYPE_CHECKING:
     from kgcp.io.images.remote import StoredFolder
 
 
 def _names(
-    context: click.Context,  # noqa: ARG001 - click's signature
-    parameter: click.Parameter,  # noqa: ARG001
+    context: click.Context,
+    parameter: click.Parameter,
     value: str | None,
 ) -> tuple[str, ...]:
-    return tuple(name.strip() for name in (value or "").split(",") if name.strip())
+    names = tuple(name.strip() for name in (value or "").split(",") if name.strip())
+    if value is not None and not names:
+        raise click.BadParameter("names no target", context, parameter)
+    return names
 
 
 @click.command()
@@ -55,10 +58,10 @@ def _names(
 @click.option(
     "--format",
     "formats",
-    type=click.Choice([*FORMATS]),
+    type=click.Choice([name for name in FORMATS if name not in OF_CAMERAS]),
     multiple=True,
     help="Also write the placed targets for another program, to the folder places; may be"
-    " repeated. The formats are those of 'kgcp export-gcp'.",
+    " repeated. The formats are those of 'kgcp export-gcp' that hold points.",
 )
 @detections_option
 @json_option
@@ -91,18 +94,20 @@ def command(
     from kgcp.report.plotting import load_matplotlib
 
     load_matplotlib()  # before the report does
-    from kgcp.pipeline.ground.place import PlaceOptions, place_flight, write_places
+    from kgcp.io.exporters.write import not_renewed
+    from kgcp.pipeline.ground.place import EXPORTS, PlaceOptions, place_flight, write_places
 
     options = PlaceOptions(targets, poses, min_frames, has_exact_poses=eo == "fixed")
     with open_workspace(flight, out, (DETECTIONS,)) as workspace:
         the_flight = read_flight(workspace.flight)
         places = place_flight(the_flight, detections or workspace.out / DETECTIONS, options)
         written = write_places(places, workspace.out, formats)
+        older = not_renewed(workspace.out / EXPORTS, written)
     if as_json:
         import json
 
         files = [*map(workspace.named, written)]
-        click.echo(json.dumps({**places.summary(), "files": files}))
+        click.echo(json.dumps({**places.summary(), "files": files, "not_renewed": older}))
     for sentence in places.sentences:
         click.echo(sentence, err=True)
     for name, reason in places.placement.skipped.items():
@@ -111,3 +116,5 @@ def command(
         click.echo(f"kgcp: look: {doubt}", err=True)
     for path in written:
         click.echo(f"wrote {workspace.named(path)}", err=True)
+    if older:
+        click.echo(f"left as an earlier run wrote them: {', '.join(older)}", err=True)

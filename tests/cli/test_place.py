@@ -347,6 +347,7 @@ def test_poses_of_other_frames_are_no_poses(
         (("--targets", "A,Z"), "'Z': is not in flight.toml"),
         (("--min-frames", "40"), "12 of them with a reference pose; 40 are needed"),
         (("--poses", "none.csv"), "none.csv: does not exist; name a file of poses (--poses)"),
+        (("--poses", "."), ".: is no file; name a file of poses (--poses)"),
     ],
 )
 def test_what_cannot_be_placed_is_one_line(
@@ -357,6 +358,30 @@ def test_what_cannot_be_placed_is_one_line(
     assert result.exit_code == 1
     assert problem in result.stderr
     assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("option", [("--targets", " ,"), ("--format", "colmap")])
+def test_options_that_name_nothing_to_place_are_usage_errors(
+    tmp_path: Path, option: tuple[str, str]
+) -> None:
+    folder = GroundFlight(frames=3).write(tmp_path / "flight")
+    assert run(folder, *option).exit_code == 2
+
+
+def test_names_of_targets_are_not_formulas(tmp_path: Path) -> None:
+    folder = GroundFlight(names=("P$^$", "B", "C", "D")).write(tmp_path / "flight")
+    result = run(folder)
+    assert result.exit_code == 0, result.stderr
+    assert "P$^$" in (folder / "kgcp" / "places.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.usefixtures("_no_figures")
+def test_files_of_an_earlier_run_are_named(tmp_path: Path) -> None:
+    folder = GroundFlight().write(tmp_path / "flight")
+    assert "earlier run" not in run(folder, "--format", "odm").stderr
+    result = run(folder, "--format", "csv", "--json")
+    assert "left as an earlier run wrote them: odm\n" in result.stderr
+    assert json.loads(result.stdout)["not_renewed"] == ["odm"]
 
 
 def test_without_a_readable_frame_that_is_said(tmp_path: Path) -> None:

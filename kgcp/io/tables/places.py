@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kgcp.io.files.csv_text import csv_text
+from kgcp.io.files.csv_text import DEGREE_DECIMALS, csv_text
 from kgcp.io.tables.columns import (
     BOOLEAN,
     INTEGER,
@@ -22,6 +22,7 @@ from kgcp.io.tables.columns import (
 from kgcp.network.ground.target_places import PlacedTarget
 
 _AXES = "xyz"
+_METRE_DECIMALS = 9
 _MOMENTS = ("x_px", "y_px", "s_xx_px2", "s_xy_px2", "s_yy_px2")
 
 
@@ -83,13 +84,21 @@ def residual_rows(placed: Sequence[PlacedTarget]) -> Iterator[Row]:
             yield row_of(PLACE_RESIDUAL_COLUMNS, PlaceResidual(target, row))
 
 
-def places_csv(placed: Sequence[PlacedTarget]) -> str:
-    """Return places as text, in the columns of a list of points of other programs."""
+def places_csv(placed: Sequence[PlacedTarget], *, is_geographic: bool) -> str:
+    """Return places as text, in the columns of a list of points of other programs.
+
+    Parameters
+    ----------
+    is_geographic : bool
+        Whether x and y are degrees, which need more decimals than metres.
+    """
     normal = [f"normal_{a}" for a in _AXES]
     columns = ["name", *_AXES, *(f"sd_{a}" for a in _AXES), "diameter_m", "sd_diameter_m", *normal]
     rows = []
     for target in placed:
-        position = (f"{value:.9f}" for value in target.position_map.tolist())
+        x, y, z = target.position_map.tolist()
+        across = DEGREE_DECIMALS if is_geographic else _METRE_DECIMALS
+        position = f"{x:.{across}f}", f"{y:.{across}f}", f"{z:.{_METRE_DECIMALS}f}"
         sds = (f"{value:.6f}" for value in target.sds[:3].tolist())
         size = (f"{target.diameter_m:.6f}", f"{target.sd_diameter_m:.6f}")
         along = (f"{value:.7f}" for value in target.normal.tolist())

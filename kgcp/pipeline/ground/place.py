@@ -12,6 +12,7 @@ import numpy as np
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.attitude import ReferencePoses
+from kgcp.georef.crs import is_geographic
 from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.gcp import Gcp, build_gcps
 from kgcp.georef.local_frame import LocalFrame
@@ -268,25 +269,26 @@ def write_places(
     placed = places.placement.targets
     flight = places.flight
     tables = (folder / "places.parquet", folder / "place_residuals.parquet")
-    rows = (row_of(PLACE_COLUMNS, target) for target in placed)
-    about = {**places.provenance, "crs": places.local_frame.crs}
-    write_table(tables[0], PLACE_COLUMNS, rows, about)
-    write_table(tables[1], PLACE_RESIDUAL_COLUMNS, residual_rows(placed), about)
-    names = ("places.csv", "places.json", "places.html")
+    crs, names = places.local_frame.crs, ("places.csv", "places.json", "places.html")
     page = PlacesPage(
         flight.name,
-        places.local_frame.crs,
+        crs,
         places.placement,
         places.doubts,
         draw_places(placed),
         [*(path.name for path in tables), *names],
     )
     text = json.dumps(places.summary(), indent=1, allow_nan=False)
-    texts = dict(zip(names, (places_csv(placed), f"{text}\n", render_places(page)), strict=True))
+    csv = places_csv(placed, is_geographic=is_geographic(crs))
+    texts = dict(zip(names, (csv, f"{text}\n", render_places(page)), strict=True))
+    rows = (row_of(PLACE_COLUMNS, target) for target in placed)
+    about = {**places.provenance, "crs": crs}
+    write_table(tables[0], PLACE_COLUMNS, rows, about)
+    write_table(tables[1], PLACE_RESIDUAL_COLUMNS, residual_rows(placed), about)
     write_all({folder / name: text.encode() for name, text in texts.items()})
     written = [*tables, *(folder / name for name in names)]
     if formats:
-        points = MapPoints(places.local_frame.crs, places.gcps(), flight.camera)
+        points = MapPoints(crs, places.gcps(), flight.camera)
         written += write_formats(points, formats, folder / EXPORTS)
     return tuple(written)
 
@@ -317,7 +319,8 @@ def _poses(
     if file is None:
         return data.reference_poses
     if not file.is_file():
-        raise KgcpError(f"{file}: does not exist; name a file of poses", option="poses")
+        problem = "is no file" if file.exists() else "does not exist"
+        raise KgcpError(f"{file}: {problem}; name a file of poses", option="poses")
     return read_reference_poses(file, crs=flight.crs, frames=sorted(set(frames)))
 
 

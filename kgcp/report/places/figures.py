@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.axes import Axes
 
+from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.network.ground.target_places import PlacedTarget
 from kgcp.report.style import BLUE, GREEN, GREY, VERMILION, Picture, picture, sheet
 
@@ -32,10 +34,14 @@ def _diameters(placed: tuple[PlacedTarget, ...]) -> Picture:
         axes = figure.subplots()
         axes.axhline(0.0, color="black", linewidth=0.8)
         axes.errorbar(places, off, yerr=2.0 * np.array(sd), fmt="o", color=BLUE, capsize=4.0)
-        axes.set_xticks(places, [target.target for target in placed])
+        _name_ticks(axes, places, [target.target for target in placed])
         axes.set_xlim(-0.5, len(placed) - 0.5)
         axes.set_ylabel("diameter: placed − stated [‰]")
         return picture(figure)
+
+
+def _name_ticks(axes: Axes, places: FloatArray | IndexArray, names: list[str]) -> None:
+    axes.set_xticks(places, names, parse_math=False)  # names may have dollars
 
 
 def _positions(placed: tuple[PlacedTarget, ...]) -> Picture:
@@ -51,7 +57,7 @@ def _positions(placed: tuple[PlacedTarget, ...]) -> Picture:
             axes.errorbar(
                 places, off, yerr=2.0 * sd, fmt="o", color=colour, capsize=4.0, label=name
             )
-        axes.set_xticks(np.arange(len(stated)), [target.target for target in stated])
+        _name_ticks(axes, np.arange(len(stated)), [target.target for target in stated])
         axes.set_xlim(-0.5, len(stated) - 0.5)
         axes.set_ylabel("place: placed − stated [mm]")
         axes.legend(ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
@@ -73,16 +79,16 @@ def _frames(placed: tuple[PlacedTarget, ...]) -> Picture:
     with sheet(3.8) as figure:
         axes = figure.subplots()
         axes.axhline(_EXPECTED_CHI2, color=GREY, linewidth=0.8, label="expected")
-        first, ticks = 0, []
+        first, middles = 0, []
         for target in placed:
             rows = first + np.arange(len(target.frames))
             used, chi2 = target.is_used, np.maximum(target.chi2, 1e-3)
             axes.plot(rows[used], chi2[used], "o", color=BLUE, markersize=3.5)
             axes.plot(rows[~used], chi2[~used], "x", color=VERMILION, markersize=7.0)
-            ticks.append((float(rows.mean()), target.target))
+            middles.append(rows.mean())
             first += len(rows) + 1
         axes.set_yscale("log")
-        axes.set_xticks([place for place, _ in ticks], [name for _, name in ticks])
+        _name_ticks(axes, np.array(middles), [target.target for target in placed])
         axes.set_xlabel("frames, target by target (×: left out)")
         axes.set_ylabel("χ² of five numbers")
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))
