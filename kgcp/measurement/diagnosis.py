@@ -10,6 +10,7 @@ import numpy as np
 from kgcp.errors import Reason
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.conic import Ellipse
+from kgcp.geometry.grey_range import full_scale
 from kgcp.measurement.records import Considered
 from kgcp.measurement.search.dot_reading import describe_dots, read_dots
 from kgcp.measurement.search.template_match import CODE_LIKE, match_templates, polar_patch
@@ -121,7 +122,7 @@ def _plain_cause(
         return Reason.HIDDEN, f"{unseen:.0%} of its edge not seen"
     if template_match.dot_contrast < _FAINT_DOTS:
         return Reason.TOO_BLURRED, f"dots of {template_match.dot_contrast:.0%} of the contrast"
-    burnt = _share_burnt(patch, ring, float(np.iinfo(grey.dtype).max))
+    burnt = _share_burnt(patch, ring, full_scale(grey))
     if burnt > _BURNT:
         return Reason.CLIPPED, f"{burnt:.0%} of its white burnt out"
     return None

@@ -8,6 +8,7 @@ from cv2.typing import MatLike
 
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Response
+from kgcp.geometry.grey_range import full_scale
 from kgcp.measurement.discs.measure import measure_discs
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.discs.records import Disc, Polarity
@@ -78,7 +79,7 @@ def _groups(
 
 def _holes(grey: GreyArray, discs: list[Disc]) -> list[MatLike]:
     """Return the contours of holes, by levels between those of the discs and of their ground."""
-    full = float(np.iinfo(grey.dtype).max)
+    full = full_scale(grey)
     inside = float(np.median([disc.inside for disc in discs]))
     outside = float(np.median([disc.outside for disc in discs]))
     holes = []

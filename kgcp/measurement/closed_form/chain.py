@@ -20,6 +20,7 @@ from kgcp.geometry.circle import (
     pose_on_plane,
 )
 from kgcp.geometry.conic import Ellipse, ellipse_from_conic, fit_ellipse
+from kgcp.geometry.grey_range import full_scale
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.measurement.closed_form.edges import EdgeFit, fit_edge, spline_patch_around
 from kgcp.measurement.records import Alternative, Appearance, Measurement
@@ -220,7 +221,7 @@ def _check_geometry(posed: PosedRing, outer: EdgeFit, shift_px: float) -> None:
 def _appearance(
     grey: GreyArray, target: Target, match: CodeMatch, outer: Ellipse, shift_px: float
 ) -> Appearance:
-    full_range = float(np.iinfo(grey.dtype).max)
+    full_range = full_scale(grey)
     return Appearance(
         radius_px=outer.a * target.ring.outer_diameter_m / match.ring.outer_diameter_m,
         black=match.black / full_range,
@@ -240,4 +241,4 @@ def _saturated_share(grey: GreyArray, outer: Ellipse) -> float:
     unit = (pixels - outer.centre) @ np.linalg.inv(outer.stretch)
     inside = np.einsum("...i,...i->...", unit, unit) <= 1.0
     values = grey[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1][inside]
-    return float(np.mean(values == np.iinfo(grey.dtype).max)) if values.size else 0.0
+    return float(np.mean(values == full_scale(grey))) if values.size else 0.0

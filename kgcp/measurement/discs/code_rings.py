@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.grey_range import brightest_level
 from kgcp.measurement.discs.records import DiscOutline
 from kgcp.targets.fields.points import CodeRing
 
@@ -19,7 +20,7 @@ _PER_SECTOR = 16  # samples along the ring
 _MIDDLE = slice(_PER_SECTOR // 4, 3 * _PER_SECTOR // 4)  # of a sector: blur mixes its ends
 _ACROSS = (0.35, 0.5, 0.65)  # of the ring's width
 _LEAST_MARGIN = 0.2  # of the contrast, from the middle between 0 and 1
-_LEAST_CONTRAST = 0.02  # of the range of grey values
+_LEAST_CONTRAST = 0.02  # of what is white in the photograph
 _MOST_UNEVEN = 0.35  # of the contrast: the ground beside a letter shows its neighbours
 
 
@@ -34,7 +35,7 @@ def read_codes(
         Grey values of 8 or 16 bits.
     outlines : sequence of DiscOutline
     """
-    values = grey.astype(np.float32) / np.iinfo(grey.dtype).max
+    values = grey.astype(np.float32) / brightest_level(grey)
     return [_read(values, outline, ring) for outline in outlines]
 
 

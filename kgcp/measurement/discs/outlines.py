@@ -11,6 +11,7 @@ import numpy as np
 from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.ellipse_fit import fit_ellipses
+from kgcp.geometry.grey_range import brightest_level
 from kgcp.measurement.discs.blobs import find_blobs
 from kgcp.measurement.discs.edge_points import (
     DIRECTIONS,
@@ -36,7 +37,7 @@ _LEAST_INLIERS = 0.8
 _RESIDUAL_PX, _RESIDUAL = 0.3, 0.012  # largest root mean square: pixels, and of the radius
 _LEAST_SEMI_AXIS_PX = 1.2
 _MOST_ASPECT = 4.0
-_LEAST_CONTRAST = 0.03  # of the grey values' range
+_LEAST_CONTRAST = 0.03  # of what is white in the photograph
 _NEAR, _ALIKE = 0.3, 1.25  # centres, of the radius, and ratio of radii of one and the same edge
 _CONCENTRIC = 0.2  # of the larger radius: how far the centre of a hole may be off
 _LARGEST_HOLE = 0.95  # of the radius
@@ -167,14 +168,10 @@ def _edges_of(
         fitted[shares == 0.0] = (0.0, 0.0, 1.0, 1.0, 0.0)
         mark_inliers(edges, strengths, ellipses, fitted, limits_px, inlying, residual_px)
         ellipses = _carried(ellipses, fitted)
-    contrast = _contrast(levels, inlying) / _full_scale(grey)
+    contrast = _contrast(levels, inlying) / brightest_level(grey)
     return _Edges(
         ellipses, np.where(shares > 0.0, inlying.mean(axis=1), 0.0), residual_px, contrast
     )
-
-
-def _full_scale(grey: GreyArray) -> float:
-    return float(np.iinfo(grey.dtype).max) if np.issubdtype(grey.dtype, np.integer) else 1.0
 
 
 def _contrast(levels: FloatArray, inlying: BoolArray) -> FloatArray:

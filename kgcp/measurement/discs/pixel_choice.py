@@ -10,6 +10,7 @@ import numpy as np
 
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
+from kgcp.geometry.grey_range import full_scale
 from kgcp.measurement.discs.affine_model import Geometry
 from kgcp.measurement.image_model.blur import Blur
 
@@ -60,7 +61,7 @@ def cut_disc_window(grey: GreyArray, geometry: Geometry, reach_px: float) -> Dis
     x0, y0 = max(math.floor(x - half_x), 0), max(math.floor(y - half_y), 0)
     x1 = min(math.ceil(x + half_x) + 1, grey.shape[1])
     y1 = min(math.ceil(y + half_y) + 1, grey.shape[0])
-    scale = float(np.iinfo(grey.dtype).max) if np.issubdtype(grey.dtype, np.integer) else 1.0
+    scale = full_scale(grey)
     levels = grey[y0:y1, x0:x1].astype(np.float64).ravel() / scale
     # floats have no steps: as fine as 16 bits
     count = 1.0 / scale if np.issubdtype(grey.dtype, np.integer) else 1.0 / 65535.0

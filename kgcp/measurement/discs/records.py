@@ -60,7 +60,7 @@ class DiscOutline:
     polarity : Polarity
         That of what is directly inside the edge, against what is directly outside.
     contrast : float
-        Difference of the levels on either side, 0…1 of the grey values' range.
+        Difference of the levels on either side, as a share of what is white in the photograph.
     residual_px : float
         Root mean square of the edge points' distances from the ellipse [px].
     hole : Ellipse or None

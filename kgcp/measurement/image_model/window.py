@@ -11,6 +11,7 @@ import numpy as np
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 from kgcp.geometry.camera import Camera
+from kgcp.geometry.grey_range import full_scale
 from kgcp.geometry.pixel_grid import rays_of_window
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.image_model.noise import find_censoring
@@ -90,7 +91,7 @@ def cut_window(
     )
     if (x1 - x0) <= 0 or (y1 - y0) <= 0 or (x1 - x0) * (y1 - y0) < 0.25 * np.prod(high - low):
         raise Rejection(Reason.CUT, f"box {low.round()} … {high.round()} px")
-    scale = float(np.iinfo(grey.dtype).max) if np.issubdtype(grey.dtype, np.integer) else 1.0
+    scale = full_scale(grey)
     rays = rays_of_window(
         camera, np.arange(x0, x1, dtype=np.float64), np.arange(y0, y1, dtype=np.float64)
     )

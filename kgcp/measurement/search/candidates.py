@@ -11,6 +11,7 @@ from kgcp.errors import Reason, Rejection
 from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
 from kgcp.geometry.conic import Ellipse
+from kgcp.geometry.grey_range import brightest_level
 from kgcp.measurement.search.code_signal import CodeMatch
 from kgcp.measurement.search.outlines import Seeds, find_seeds, track_outlines
 from kgcp.measurement.search.pyramid import build_pyramid
@@ -22,7 +23,7 @@ from kgcp.targets.layout import Ring
 
 # Tuning of the candidates. Its benchmarks are `benchmarks.search.hard_frames`, for what is found
 # (values in docs/method.md, "Constants of the search"), and `benchmarks.search.false_alarms`.
-_MIN_CONTRAST = 0.02  # of the grey values' range
+_MIN_CONTRAST = 0.02  # of what is white in the frame
 _MIN_DOT_CONTRAST = 0.1  # of the ring's contrast: what blur leaves of dots
 _UNEVEN = 0.85  # spread of ink, disc and plate, of the contrast in light: shade leaves a sixth
 # Spread of what disc and plate differ by, over half of the angles, of the ring's depth: up to 0.6
@@ -91,13 +92,14 @@ def find_dotted(
     They have a dark ring between bright disc and plate, brighter in places. Rings of the same
     proportions, such as replicas, share their candidates.
     """
+    least_contrast = _MIN_CONTRAST * brightest_level(grey)
     by_shape: dict[tuple[float, float], tuple[Candidate, ...]] = {}
     by_ring: dict[Ring, tuple[Candidate, ...]] = {}
     for ring in rings:
         ratios = ring.inner_ratio, ring.code_diameter_m / ring.outer_diameter_m
         shape = round(ratios[0], _DIGITS), round(ratios[1], _DIGITS)
         if shape not in by_shape:
-            by_shape[shape] = _dotted(grey, outlines, *ratios)
+            by_shape[shape] = _dotted(grey, outlines, *ratios, least_contrast)
         by_ring[ring] = by_shape[shape]
     return by_ring
 
@@ -130,14 +132,17 @@ def find_code(
 
 
 def _dotted(
-    grey: GreyArray, outlines: tuple[Ellipse, ...], inner: float, code: float
+    grey: GreyArray,
+    outlines: tuple[Ellipse, ...],
+    inner: float,
+    code: float,
+    least_contrast: float,
 ) -> tuple[Candidate, ...]:
     """Return the candidates for rings with such circles, of their outer radius."""
     radii = np.array((_DISC_SHARE * inner, code, _PLATE))
     values = sample_ellipses(grey, outlines, radii, CIRCLE)
     dotted = np.empty(len(outlines), dtype=bool)
-    least = _MIN_CONTRAST * float(np.iinfo(grey.dtype).max)
-    _mark_dotted(np.sort(values, axis=2), least, dotted)
+    _mark_dotted(np.sort(values, axis=2), least_contrast, dotted)
     dotted[dotted] = _are_alike_inside_and_outside(values[dotted])
     kept = tuple(outlines[i] for i in np.flatnonzero(dotted))
     return tuple(map(Candidate, kept, sample_ellipses(grey, kept, SAMPLED_RADII, CIRCLE)))

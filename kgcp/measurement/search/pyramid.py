@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import GreyArray, IndexArray
+from kgcp.geometry.grey_range import brightest_level
 
-_BRIGHTEST_QUANTILE = 0.999
 _SMALLEST_PX = 6
 
 _Sums = npt.NDArray[np.uint16]
@@ -39,14 +39,10 @@ def factor_of(level: int) -> float:
 
 
 def eight_bit(grey: GreyArray) -> GreyArray:
-    """Return an 8-bit frame for the search, contiguous.
-
-    A 16-bit frame often holds 10 or 12 bits: its range is stretched to its brightest pixels.
-    """
+    """Return an 8-bit frame for the search, contiguous, with its brightest pixels white."""
     if grey.dtype == np.uint8:
         return np.ascontiguousarray(grey)
-    white = max(float(np.quantile(grey[::4, ::4], _BRIGHTEST_QUANTILE)), 1.0)
-    return cv2.convertScaleAbs(grey, alpha=255.0 / white)
+    return cv2.convertScaleAbs(grey, alpha=255.0 / brightest_level(grey))
 
 
 def build_pyramid(grey: GreyArray) -> Pyramid:

@@ -46,8 +46,9 @@ def coded_disc(
 def test_the_code_is_read(turn: float, tilt: tuple[float, float], *, is_bright: bool) -> None:
     ((grey, outline),) = coded_disc(turn, tilt, is_bright=is_bright)
     assert read_codes(grey, [outline], RING) == [RING.canonical(CODE)]
-    wide = grey.astype(np.uint16) * 257
-    assert read_codes(wide, [outline], RING) == [RING.canonical(CODE)]
+    for factor in (257, 4):  # of 16 and of 10 bits
+        wide = grey.astype(np.uint16) * factor
+        assert read_codes(wide, [outline], RING) == [RING.canonical(CODE)]
 
 
 def test_a_disc_without_code_has_none() -> None:
