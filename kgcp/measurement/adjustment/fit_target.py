@@ -88,17 +88,18 @@ def measure_by_model(
     Rejection
         `CUT`, `EDGES_LOST`, `NO_CONTRAST`, `POOR_FIT` or `OTHER_CODE`.
     """
-    pose = _without_edge_shift(start)
+    outlined_px = _outlined_radius_px(start, target)
+    pose = _without_edge_shift(start, outlined_px)
     problem = fit_problem_of(grey, camera, target, pose, prior.rotation)
     may_be_finer = problem.tone is Tone.OF_BINS  # other bins are as good as single pixels
     problem = replace(problem, visible=visible, may_be_finer=may_be_finer)
-    blur = _start_blur(start, problem.window.binning)
+    blur = _start_blur(start.blur_px, outlined_px, problem.window.binning)
     try:
         fits = fit_in_any_light(problem, pose, blur, prior.tone_base)
     except UnevenLightInBins:
         finer = finer_problem_of(grey, camera, target, pose, prior.rotation)
         problem = replace(finer, visible=visible)
-        blur = _start_blur(start, problem.window.binning)
+        blur = _start_blur(start.blur_px, outlined_px, problem.window.binning)
         fits = fit_in_any_light(problem, pose, blur, prior.tone_base)
     try:
         measurement = _checked(camera, target, start, fits.likelier, prior.normal)
@@ -131,12 +132,18 @@ def _checked(
     return measurement
 
 
-def _without_edge_shift(start: InitialPose) -> Pose:
+def _outlined_radius_px(start: InitialPose, target: Target) -> float:
+    """Return the outer radius of the ring that the start was found by: a replica, perhaps."""
+    (outlined,) = (ring for ring in target.rings if ring.name == start.ring)
+    return start.radius_px * outlined.outer_diameter_m / target.ring.outer_diameter_m
+
+
+def _without_edge_shift(start: InitialPose, outlined_px: float) -> Pose:
     """Return the pose that the start would have if the outer edge were not displaced.
 
     Its distance is from the outer circle alone, of which the radius is short by δ.
     """
-    shrink = start.radius_px / (start.radius_px + start.edge_shift_px)
+    shrink = outlined_px / (outlined_px + start.edge_shift_px)
     return Pose(start.pose.rotation, shrink * start.pose.translation_m)
 
 
@@ -223,9 +230,9 @@ def _measured_count(camera: Camera, target: Target, contour: FloatArray) -> int:
     return sum(2 + len(ring.code_deg) for ring in rings)
 
 
-def _start_blur(start: InitialPose, binning: int) -> Blur:
+def _start_blur(blur_px: float, outlined_px: float, binning: int) -> Blur:
     """Return the blur that the start has seen, in bins; that of a sharp frame at least."""
-    seen_px = min(start.blur_px, _LARGEST_START_BLUR * start.radius_px)
+    seen_px = min(blur_px, _LARGEST_START_BLUR * outlined_px)
     variance = variance_in_bins(max(_SHARP_PX2, seen_px * seen_px), binning)
     return Blur(variance, variance, 0.0)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -21,11 +22,15 @@ from kgcp.measurement.adjustment.two_poses import TwoPoses
 from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.plate_prior import PlatePrior
 from kgcp.measurement.records import InitialPose, Measurement, ToneBase
+from kgcp.measurement.search.candidates import find_code, find_dotted, find_rings
+from kgcp.measurement.search.initial_pose import initial_pose
+from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import DECOY_PLATE, TARGET_PLATE
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 from kgcp.simulation.light_field import Cloud, PlateLight
 from kgcp.simulation.light_settings import Dirt
 from kgcp.simulation.point_spread import Aberration
+from kgcp.targets.layout import Target
 from tests.measurement.jpeg import compressed
 from tests.measurement.lens import LENS
 
@@ -319,6 +324,35 @@ def test_a_pose_that_the_image_does_not_rule_out_has_its_own_covariance(
         assert 0.0 <= seen.alternative.ambiguity < 8.0
         assert cov is not None
         assert cov[2, 2] == pytest.approx(seen.uncertainty.pose_cov[2, 2], rel=0.6)
+
+
+@pytest.mark.parametrize(("radius_px", "gain"), [(9.0, 1.0), (9.0, 2.2), (12.0, 3.0), (16.0, 2.2)])
+def test_the_start_from_a_replica_is_good_to_two_per_cent(
+    target: Target,
+    camera: Camera,
+    place_plate: Callable[..., Pose],
+    draw_frame: Callable[..., GreyArray],
+    monkeypatch: pytest.MonkeyPatch,
+    radius_px: float,
+    gain: float,
+) -> None:
+    """Burnt white displaces the replica's edges, which are a fifth as large as the ring's."""
+    replica, settings = target.replicas[0], DetectSettings()
+    pose = place_plate((240.0, 180.0), radius_px / 0.2, tilt_deg=10.0)
+    light = {"black": 0.06 * gain, "white": 0.75 * gain, "ground": 0.3 * gain}
+    frame = draw_frame((target, pose), blur_px=1.1, **light)
+    candidates = find_dotted(frame, find_rings(frame, settings), [replica])[replica]
+    matches, _ = find_code(candidates, replica, settings)
+    starts: list[Pose] = []
+
+    def take_start(*arguments: object) -> None:
+        starts.append(cast("Pose", arguments[3]))
+        raise Rejection(Reason.CUT, "seen")
+
+    monkeypatch.setattr("kgcp.measurement.adjustment.fit_target.fit_problem_of", take_start)
+    with pytest.raises(Rejection, match="seen"):
+        measure_by_model(frame, camera, target, initial_pose(frame, camera, target, matches[0]))
+    assert starts[0].distance_m == pytest.approx(pose.distance_m, rel=0.02)
 
 
 @pytest.mark.parametrize("radius_px", [12.0, 30.0])
