@@ -97,6 +97,35 @@ def test_distances_in_uneven_light_are_right_and_as_uncertain_as_said(
     assert 0.1 < math.sqrt(np.mean(np.square(sigmas))) < 2.0
 
 
+@pytest.mark.parametrize("lights", [highlight, dirt])
+def test_a_frame_upside_down_gives_the_same(
+    photograph: Photograph, start_near: StartNear, lights: Lights
+) -> None:
+    """Knots that hung on the window's corner made differences of 0.5 to 1.1 σ (RMS)."""
+    turned = replace(LENS, cx=LENS.width - 1.0 - LENS.cx, cy=LENS.height - 1.0 - LENS.cy)
+    half_turn, off = np.diag([-1.0, -1.0, 1.0]), []
+    for seed in range(4):
+        rng = np.random.default_rng(500 + seed)
+        pose = some_pose(rng)
+        grey = photograph(LENS, pose, rng, gain=0.65, field=lights(rng))
+        start = start_near(LENS, pose, rng)
+        turned_pose = Pose(half_turn @ start.pose.rotation, half_turn @ start.pose.translation_m)
+        upright, upside_down = (
+            measure_by_model(*each)
+            for each in (
+                (grey, LENS, TARGET_PLATE.target, start),
+                (
+                    np.ascontiguousarray(grey[::-1, ::-1]),
+                    turned,
+                    TARGET_PLATE.target,
+                    replace(start, pose=turned_pose),
+                ),
+            )
+        )
+        off.append((upside_down.distance_m - upright.distance_m) / upright.sd_distance_m)
+    assert math.sqrt(np.mean(np.square(off))) < 0.2
+
+
 @pytest.mark.parametrize("gain", [0.65, 1.8], ids=["seen", "burnt"])
 def test_an_antenna_s_sharp_shadow_is_understood_by_its_edges(
     photograph: Photograph, start_near: StartNear, gain: float
@@ -179,6 +208,7 @@ def test_where_a_fit_with_levels_starts_does_not_matter(
 ) -> None:
     """With white and the plate's levels free at once, fits in dirt stayed 2 σ off."""
     camera, srgb = replace(LENS, response=Response.UNKNOWN), Sensor(tone=ToneCurve.SRGB)
+    apart = []
     for seed in range(3):
         rng = np.random.default_rng(500 + seed)
         pose = some_pose(rng)
@@ -193,8 +223,8 @@ def test_where_a_fit_with_levels_starts_does_not_matter(
             off = Pose(fit.parameters.pose.rotation, centre_m + sigmas * sd_m * ray)
             start = fit.parameters.at(off)
             again = random_levels.fit_levels(fit.sample.problem, [start], fit.unknowns)
-            apart_m = ray @ (again.parameters.pose.translation_m - centre_m)
-            assert abs(apart_m) < 0.4 * sd_m
+            apart.append(ray @ (again.parameters.pose.translation_m - centre_m) / sd_m)
+    assert math.sqrt(np.mean(np.square(apart))) < 0.4
 
 
 def test_both_bases_of_the_tone_curve_see_the_same_pixels_under_a_highlight(
@@ -357,11 +387,12 @@ def test_pixels_beside_edges_tie_the_levels_of_large_rings_together(
     assert used == {near_sigmas}
 
 
+@pytest.mark.parametrize("seed", [39, 41])
 def test_dirt_on_a_small_ring_is_told_by_its_edges(
-    photograph: Photograph, start_near: StartNear, monkeypatch: pytest.MonkeyPatch
+    photograph: Photograph, start_near: StartNear, monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
-    """Cells of 8 px say too little there, and the light was taken for even: 0.12 % off."""
-    rng = np.random.default_rng(38)
+    """Cells of 8 px say too little there, and the light was taken for even: 0.25 % off."""
+    rng = np.random.default_rng(seed)
     pose = some_pose(rng)
     pose = Pose(pose.rotation, 3.5 * pose.translation_m)
     grey = photograph(LENS, pose, rng, gain=0.65, field=dirt(rng))

@@ -202,11 +202,10 @@ def field_of(
     field: LightField, problem: FitProblem, plateaus: Plateaus, light: Light
 ) -> LightField:
     """Return a field whose finest knots have the levels seen."""
-    knots, window = field.knots, problem.window
-    spacing, columns, rows = knots.spacings_px[-1], knots.columns[-1], knots.rows[-1]
-    x = np.clip(spacing * (np.arange(columns) - 0.5) - 0.5, 0, window.width - 1)
-    y = np.clip(spacing * (np.arange(rows) - 0.5) - 0.5, 0, window.height - 1)
-    at = (np.rint(y).astype(int)[:, None] * window.width + np.rint(x).astype(int)).ravel()
+    window, finest = problem.window, len(field.knots.spacings_px) - 1
+    x, y = np.rint(field.knots.places_px(finest)).astype(np.intp)
+    columns = np.clip(x - window.x0, 0, window.width - 1)
+    at = np.clip(y - window.y0, 0, window.height - 1) * window.width + columns
     values = np.zeros_like(field.values)
     seen = decoded(plateaus.levels[:, at], problem.tone)
     levels = seen - np.array([[light.black], [light.white]])

@@ -107,7 +107,12 @@ def even_field(problem: FitProblem) -> LightField:
     radius, window = problem.outer_radius_px, problem.window
     fine, coarse = max(_FINEST_PX, radius / _FINE), _COARSE * radius
     spacings_px = (coarse, fine) if coarse > 1.5 * fine else (fine,)
-    knots = knots_over(window.x0, window.y0, window.width, window.height, spacings_px)
+    knots = knots_over(
+        (window.x0, window.x0 + window.width - 1),
+        (window.y0, window.y0 + window.height - 1),
+        problem.centre_px,
+        spacings_px,
+    )
     count = sum(knots.counts)
     return LightField(
         knots=knots,

@@ -29,11 +29,10 @@ LEVEL_OFFSET_PRECISION = 4.0
 class Knots:
     """Grids of knots over a window."""
 
-    # the corner of the first cell [px]
-    x0: float
-    y0: float
     spacings_px: tuple[float, ...]  # (g,)
-    # (g,): how many knots each grid has
+    # (g,): the corner of each grid's first cell [px], and how many knots it has
+    x0_px: tuple[float, ...]
+    y0_px: tuple[float, ...]
     columns: tuple[int, ...]
     rows: tuple[int, ...]
 
@@ -56,25 +55,45 @@ class Knots:
         for g, spacing in enumerate(self.spacings_px):
             part = slice(g * reach, (g + 1) * reach)
             counts = self.columns[g], self.rows[g]
-            corner = self.x0, self.y0
+            corner = self.x0_px[g], self.y0_px[g]
             _fill_in_weights(
                 pixels, corner, spacing, counts, first, knots[:, part], weights[:, part]
             )
             first += self.counts[g]
         return knots, weights
 
+    def places_px(self, grid: int) -> FloatArray:
+        """Return where the knots of a grid are (2, k)."""
+        return _places_px(self, grid)
+
 
 def knots_over(
-    x0: float, y0: float, width: int, height: int, spacings_px: tuple[float, ...]
+    x_px: tuple[float, float],
+    y_px: tuple[float, float],
+    centre_px: FloatArray,
+    spacings_px: tuple[float, ...],
 ) -> Knots:
-    """Lay grids over a window."""
-    return Knots(
-        x0 - 0.5,
-        y0 - 0.5,
-        spacings_px,
-        tuple(int(width // spacing) + SPAN for spacing in spacings_px),
-        tuple(int(height // spacing) + SPAN for spacing in spacings_px),
-    )
+    """Lay grids over the pixels between two columns and two rows, these included.
+
+    A point (2,) is in the middle of a cell of every grid: what is about it is seen with the same
+    knots wherever the window ends, and whichever way up the frame is.
+    """
+    x0_px, columns = _cells_over(*x_px, float(centre_px[0]), spacings_px)
+    y0_px, rows = _cells_over(*y_px, float(centre_px[1]), spacings_px)
+    return Knots(spacings_px, x0_px, y0_px, columns, rows)
+
+
+def _cells_over(
+    first_px: float, last_px: float, centre_px: float, spacings_px: tuple[float, ...]
+) -> tuple[tuple[float, ...], tuple[int, ...]]:
+    """Return where the first cell of each grid begins along an axis, and how many knots it has."""
+    begins, counts = [], []
+    for spacing in spacings_px:
+        before = math.ceil((centre_px - (first_px - 0.5)) / spacing - 0.5)
+        begin = centre_px - (before + 0.5) * spacing
+        begins.append(begin)
+        counts.append(math.ceil((last_px + 0.5 - begin) / spacing) + SPAN - 1)
+    return tuple(begins), tuple(counts)
 
 
 @compiled
@@ -239,7 +258,7 @@ class LightField:
             change = correction(added + own, step + own_step) - taken
             values[:, part] += change
             if grid + 1 < len(self.knots.spacings_px):
-                places = _places(self.knots, grid + 1)
+                places = self.knots.places_px(grid + 1)
                 added = added + _of_grid(self.knots, grid, own, places)
                 step = step + _of_grid(self.knots, grid, own_step, places)
                 taken = taken + _of_grid(self.knots, grid, change, places)
@@ -250,11 +269,10 @@ class LightField:
 
 
 @lru_cache(maxsize=4)
-def _places(knots: Knots, grid: int) -> FloatArray:
-    """Return where the knots of a grid are (2, k) [px]."""
+def _places_px(knots: Knots, grid: int) -> FloatArray:
     spacing = knots.spacings_px[grid]
-    x = knots.x0 + spacing * (np.arange(knots.columns[grid]) - 0.5)
-    y = knots.y0 + spacing * (np.arange(knots.rows[grid]) - 0.5)
+    x = knots.x0_px[grid] + spacing * (np.arange(knots.columns[grid]) - 0.5)
+    y = knots.y0_px[grid] + spacing * (np.arange(knots.rows[grid]) - 0.5)
     columns, rows = np.meshgrid(x, y)
     return np.stack((columns.ravel(), rows.ravel()))
 
@@ -265,7 +283,8 @@ def _add_values(
     """Add to `seen` what `_add_grid` does, for the values (2, k) of one grid."""
     counts = knots.columns[grid], knots.rows[grid]
     spacing = knots.spacings_px[grid]
-    _add_grid(pixels, (knots.x0, knots.y0), spacing, counts, values.copy(), seen)
+    corner = knots.x0_px[grid], knots.y0_px[grid]
+    _add_grid(pixels, corner, spacing, counts, values.copy(), seen)
 
 
 def _of_grid(knots: Knots, grid: int, values: FloatArray, pixels: FloatArray) -> FloatArray:

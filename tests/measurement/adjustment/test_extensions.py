@@ -357,7 +357,7 @@ STEP, STRIP = [0.9, 4.0, 0.8], [[2.5, 8.0, 0.3], [2.5, 16.0, 0.3]]
 def started_under(
     monkeypatch: pytest.MonkeyPatch, tone: Tone, lit: tuple[float, float], rows: list[list[float]]
 ) -> Parameters:
-    knots = knots_over(0.0, 0.0, 64, 48, (8.0,))
+    knots = knots_over((0.0, 63.0), (0.0, 47.0), np.array([32.0, 24.0]), (8.0,))
     nothing = np.zeros((2, sum(knots.counts)))
     even = LightField(knots, nothing, nothing, np.zeros(2), NO_EDGES, np.zeros(2))
     monkeypatch.setattr(extensions, "even_field", lambda _: even)

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 
 from kgcp.geometry.arrays import FloatArray
@@ -14,12 +16,14 @@ from kgcp.measurement.image_model.photometry import Light, light_after_step
 from kgcp.measurement.image_model.shadow_edges import NO_EDGES, ShadowEdges
 
 _SPACING_PX = 8.0
+CENTRE_PX = np.array([132.0, 224.0])
 
 
 def _field(
     columns: int = 64, rows: int = 48, spacings_px: tuple[float, ...] = (_SPACING_PX,)
 ) -> LightField:
-    knots = knots_over(100.0, 200.0, columns, rows, spacings_px)
+    last_px = 99.0 + columns, 199.0 + rows
+    knots = knots_over((100.0, last_px[0]), (200.0, last_px[1]), CENTRE_PX, spacings_px)
     count = sum(knots.counts)
     return LightField(
         knots,
@@ -27,7 +31,7 @@ def _field(
         np.ones((2, count)),
         np.zeros(2),
         NO_EDGES,
-        np.array([132.0, 224.0]),
+        CENTRE_PX,
     )
 
 
@@ -54,7 +58,7 @@ def test_weights_are_those_of_quadratic_b_splines() -> None:
             ]
         )
         for at, count in zip(
-            pixels - np.array([[99.5], [199.5]]),
+            pixels - np.array([field.knots.x0_px, field.knots.y0_px]),
             (field.knots.columns[0], field.knots.rows[0]),
             strict=True,
         )
@@ -62,6 +66,31 @@ def test_weights_are_those_of_quadratic_b_splines() -> None:
     columns, rows = (np.nan_to_num(each) for each in along)
     expected = np.einsum("rn,cn->nrc", rows, columns).reshape(len(dense), -1)
     assert np.abs(dense - expected).max() < 1e-12
+
+
+@given(
+    first_px=st.tuples(st.integers(0, 30), st.integers(0, 30)),
+    size_px=st.tuples(st.integers(20, 90), st.integers(20, 90)),
+    spacing_px=st.floats(4.0, 40.0),
+)
+def test_cells_cover_the_window_with_the_centre_in_the_middle_of_one(
+    first_px: tuple[int, int], size_px: tuple[int, int], spacing_px: float
+) -> None:
+    (x, y), (width, height) = first_px, size_px
+    centre_px = np.array([x + 0.37 * width, y + 0.58 * height])
+    knots = knots_over((x, x + width - 1), (y, y + height - 1), centre_px, (spacing_px,))
+    for begin, cells, first, size, centre in zip(
+        (knots.x0_px[0], knots.y0_px[0]),
+        (knots.columns[0] - 2, knots.rows[0] - 2),
+        first_px,
+        size_px,
+        centre_px,
+        strict=True,
+    ):
+        assert begin <= first - 0.5 < begin + spacing_px * (1.0 + 1e-9)
+        end = begin + cells * spacing_px
+        assert end - spacing_px * (1.0 + 1e-9) < first + size - 0.5 <= end + 1e-9
+        assert ((centre - begin) / spacing_px) % 1.0 == pytest.approx(0.5, abs=1e-6)
 
 
 def test_offsets_add_to_the_levels_everywhere_and_have_a_weak_prior() -> None:
@@ -91,7 +120,8 @@ def test_a_slope_of_the_knots_is_a_slope_of_the_field() -> None:
 def test_gradient_of_the_contrast_is_that_of_what_is_added() -> None:
     rng = np.random.default_rng(5)
     field = _field()
-    coarse = knots_over(100.0, 200.0, 64, 48, (2.5 * _SPACING_PX, _SPACING_PX))
+    spacings_px = 2.5 * _SPACING_PX, _SPACING_PX
+    coarse = knots_over((100.0, 163.0), (200.0, 247.0), CENTRE_PX, spacings_px)
     field = replace(
         field,
         knots=coarse,
