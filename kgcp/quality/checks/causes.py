@@ -90,7 +90,9 @@ def _likeliest(trials: Sequence[_Trial], before: float) -> _Trial | None:
     """Return the first trial that explains as much as the best one."""
     least = min((trial.misfit for trial in trials), default=np.inf)
     enough = max(_EXPLAINED, _ALIKE * least)
-    if least > max(_EXPLAINED, _NEARLY * before) or least > before / _GAIN:
+    # An infinite misfit, of frames outside the trajectory, has no share that may be left.
+    allowed = max(_EXPLAINED, _NEARLY * before) if np.isfinite(before) else _EXPLAINED
+    if least > allowed or least > before / _GAIN:
         return None
     limit = min(enough, before / _GAIN)
     return next((trial for trial in trials if trial.misfit <= limit), None)
@@ -283,7 +285,9 @@ def _metres(value: float, positive: str, negative: str) -> str:
 def _doubts(trial: _Trial, encounters: Encounters) -> tuple[Doubt, ...]:
     apart, left = encounters.apart_m, trial.encounters.apart_m
     together = "" if len(trial.slips) == 1 else " (one of two causes at once)"
-    figures = {"apart_m": apart, "left_m": left, "misfit": encounters.misfit, "after": trial.misfit}
+    figures = {"apart_m": apart, "left_m": left, "after": trial.misfit}
+    if np.isfinite(encounters.misfit):
+        figures["misfit"] = encounters.misfit
     return tuple(
         grave(
             slip.code,

@@ -66,7 +66,7 @@ def _of_encounters(encounters: Encounters, consistency: Consistency | None) -> I
     if consistency is not None and is_correctable:
         for sentence, remedy in corrections(consistency):
             yield mild(Cause.CORRECTION, sentence, remedy)
-    elif encounters.misfit > MISFIT:
+    elif MISFIT < encounters.misfit < np.inf:
         yield unexplained(encounters)
 
 

@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.georef.trajectory import Motion
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.tables.detections import read_attempts
 from kgcp.quality.checks.causes import causes_of
+from kgcp.quality.checks.doubt import Cause
 from kgcp.quality.checks.encounters import Encounters, misfit_of
+from kgcp.quality.checks.measured import _of_encounters
 from kgcp.quality.checks.mount import check_mount
 from kgcp.quality.checks.patterns import check_lone_frames, patterns, unexplained
 from kgcp.quality.checks.slips import remeasured, slips
@@ -138,6 +141,35 @@ def test_what_has_no_pattern_is_said_so(encounters: Encounters) -> None:
     doubt = unexplained(moved(encounters, noise))
     assert "which no single cause explains" in doubt.sentence
     assert causes_of(moved(encounters, noise)) == ()
+
+
+def along(encounters: Encounters, motion: Motion) -> Encounters:
+    vehicle = replace(encounters.vehicle, motion=motion)
+    return replace(encounters, vehicle=vehicle).at(encounters.time_s)
+
+
+def test_few_frames_inside_a_trajectory_tell_no_cause(encounters: Encounters) -> None:
+    motion = encounters.vehicle.motion
+    rows = motion.time_s < np.quantile(encounters.time_s, 0.45)
+    short = replace(
+        motion,
+        time_s=motion.time_s[rows],
+        position_m=motion.position_m[rows],
+        frame_from_body=motion.frame_from_body[rows],
+    )
+    cut = moved(along(encounters, short), np.array([0.0, 0.0, 0.2]))
+    assert cut.misfit == np.inf
+    assert causes_of(cut) == ()
+    assert not [*_of_encounters(cut, None)]
+
+
+def test_a_clock_that_moves_most_frames_outside_is_still_named(encounters: Encounters) -> None:
+    motion = encounters.vehicle.motion
+    late = along(encounters, replace(motion, time_s=motion.time_s + 18.0))
+    assert late.misfit == np.inf
+    (doubt,) = causes_of(late)
+    assert doubt.code is Cause.CLOCK
+    assert np.isfinite([*doubt.figures.values()]).all()
 
 
 def test_a_lone_frame_is_counted(encounters: Encounters) -> None:
