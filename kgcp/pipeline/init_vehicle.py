@@ -203,6 +203,8 @@ def _of_times(
     if NUMBER.fullmatch(start.time):
         if float(start.time) < _WEEK_S:
             yield from _of_week(float(start.time), named, times_s)
+        elif named is TimeSystem.GPS:
+            yield from _of_gps_seconds()
         return
     try:
         parse_time(start.time)
@@ -234,6 +236,17 @@ def _of_week(
             'make sure of it, or write time_system = "utc" into [vehicle]',
             is_assumed=True,
         )
+
+
+def _of_gps_seconds() -> Iterator[Part]:
+    """Yield the key for seconds since 1970 in a column of GPS time, which may still be Unix's."""
+    yield DraftKey("time_system", "gps", 'ASSUMED, by the name of its column; else "utc"')
+    yield Gap(
+        "trajectory",
+        "its times are GPS time, 18 s ahead of UTC, by the name of their column",
+        'make sure of it, or write time_system = "utc" into [vehicle]',
+        is_assumed=True,
+    )
 
 
 def _of_zone(text: str, named: TimeSystem | None) -> Iterator[Part]:

@@ -242,6 +242,26 @@ def test_foreign_tables_are_recognised_shown_and_readable(
         assert flight.vehicle.options.time_system == "utc"
 
 
+def test_seconds_in_a_column_of_gps_time_are_assumed_to_be_gps_time(
+    bare: Path, tmp_path: Path
+) -> None:
+    folder = copied(bare, "dji", tmp_path)
+    (folder / "rover.pos").unlink()
+    rows = ["gps_time,E,N,H"]
+    rows += [
+        f"{time_s + 18.0:.3f},{x},{y},{z}"
+        for time_s, (x, y, z) in zip(
+            PLAN.trajectory.time_s.tolist(), PLAN.trajectory.position_map.tolist(), strict=True
+        )
+    ]
+    (folder / "track.csv").write_text("\n".join(rows), encoding="utf-8")
+    _, data, said = made(folder, *TARGET, *ARM, "--crs", "EPSG:25832")
+    assert data.trajectory is not None
+    assert data.trajectory.time_s == pytest.approx(PLAN.trajectory.time_s, abs=1e-3)
+    assert "assumed: trajectory its times are GPS time, 18 s ahead of UTC" in said
+    assert 'or write time_system = "utc"' in said
+
+
 def test_longitude_and_latitude_in_a_table(bare: Path, tmp_path: Path) -> None:
     folder = copied(bare, "dji", tmp_path)
     (folder / "rover.pos").unlink()
