@@ -34,6 +34,7 @@ from kgcp.quality.checks.measured import measured_doubts
 from kgcp.quality.checks.place import check_place
 from kgcp.quality.checks.plate import check_plates
 from kgcp.quality.checks.reference import check_reference, check_visibility
+from kgcp.quality.checks.spikes import check_spikes
 from kgcp.quality.consistency import Consistency, study_consistency
 
 SAMPLED_FRAMES = 100
@@ -210,6 +211,8 @@ class FlightInputs:
             doubts += check_lever_arm(flight.vehicle.settings)
         if self.target_positions is not None and not _has_wrong_places(doubts):
             doubts += check_attitude(self.course)
+            if self.target_positions.vehicle is not None:
+                doubts += check_spikes(self.target_positions.vehicle.motion)
             if self.reference_poses is not None:
                 doubts += check_reference(self.reference_poses, self.target_positions)
         poses = self.reference_poses

@@ -204,6 +204,9 @@ ANYWAY: Mapping[str, Slip] = {
     "EXIF of half the focal length": _slip(_pictures(focal_35_mm=28.0), Cause.CALIBRATION_SIZE),
     "EXIF of another focal length": _slip(_pictures(focal_35_mm=85.0), Cause.FOCAL_LENGTH),
     "GPS of another place": _slip(_pictures(lonlat=(8.55, 47.37)), Cause.CAMERA_POSITION),
+    "one epoch 50 m off": _slip(
+        _vehicle(0, lambda x: x + 50.0 * (np.arange(len(x)) == 400)), Cause.TRAJECTORY_SPIKE
+    ),
 }
 """With and without reference poses."""
 

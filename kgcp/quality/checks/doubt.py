@@ -62,6 +62,10 @@ class Cause(StrEnum):
     CRS = "crs", "the coordinates are not in the CRS that is named"
     HEADING = "heading", "headings do not follow the course: another zero or sense of rotation"
     ATTITUDE = "attitude", "roll or pitch are not those of a vehicle on a road"
+    TRAJECTORY_SPIKE = (
+        "trajectory_spike",
+        "single epochs of the trajectory lie far from those before and after them",
+    )
     LEVER_ARM = "lever_arm", "an axis of the lever arm has the wrong sign, place or unit"
     MOUNT = "mount_deg", "the plate is mounted in another direction than mount_deg says"
     HEIGHTS = "heights", "heights are of another kind: above the geoid, or above ground"

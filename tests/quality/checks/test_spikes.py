@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.georef.trajectory import Motion
+from kgcp.quality.checks.doubt import Cause
+from kgcp.quality.checks.spikes import check_spikes
+
+START_S = 1_781_597_700.0
+
+
+def driven(time_s: FloatArray) -> FloatArray:
+    """Round bends of 12 m radius at 9 m/s, with 7 m/s² across, on a road that goes up and down."""
+    angle = 9.0 / 12.0 * time_s
+    return np.column_stack((12.0 * np.cos(angle), 12.0 * np.sin(angle), 2.0 * np.sin(time_s)))
+
+
+def motion(time_s: FloatArray, position_m: FloatArray, sd_m: float | None = 0.01) -> Motion:
+    turns = np.broadcast_to(np.eye(3), (len(time_s), 3, 3)).copy()
+    sd = None if sd_m is None else np.full_like(position_m, sd_m)
+    return Motion(START_S + time_s, position_m, turns, sd, None)
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 5.0, 20.0, 100.0])
+@pytest.mark.parametrize("jump_m", [30.0, 100.0])
+@pytest.mark.parametrize("sd_m", [0.01, None])
+def test_one_epoch_that_jumps_is_named(rate_hz: float, jump_m: float, sd_m: float | None) -> None:
+    time_s = np.arange(0.0, 60.0, 1.0 / rate_hz)
+    position_m = driven(time_s)
+    row = int(np.searchsorted(time_s, 20.0))
+    position_m[row, 2] += jump_m
+    (doubt,) = check_spikes(motion(time_s, position_m, sd_m))
+    assert (doubt.code, doubt.is_grave) == (Cause.TRAJECTORY_SPIKE, False)
+    assert "2026-06-16 08:15:20.000000 UTC" in doubt.sentence
+    assert doubt.figures["jump_m"] == pytest.approx(jump_m, abs=5.0)
+    assert doubt.figures["epochs"] == 1.0
+
+
+def test_all_such_epochs_are_counted() -> None:
+    time_s = np.arange(0.0, 60.0, 0.1)
+    position_m = driven(time_s)
+    position_m[[100, 300, 400], 0] += [5.0, -30.0, 8.0]
+    (doubt,) = check_spikes(motion(time_s, position_m))
+    assert "lies 30.0 m from" in doubt.sentence
+    assert "as 2 others do by less" in doubt.sentence
+
+
+def test_roads_raise_no_doubt() -> None:
+    for rate_hz in (1.0, 2.0, 5.0, 20.0, 100.0):
+        time_s = np.arange(0.0, 60.0, 1.0 / rate_hz)
+        assert not [*check_spikes(motion(time_s, driven(time_s)))]
+        gap = (time_s < 20.0) | (time_s > 27.0)  # half a circle later
+        assert not [*check_spikes(motion(time_s[gap], driven(time_s[gap])))]
+        braked = np.minimum(time_s, 30.0)  # from 9 m/s to 0 at once
+        assert not [*check_spikes(motion(time_s, driven(braked)))]
+    assert not [*check_spikes(motion(np.array([0.0, 1.0]), np.zeros((2, 3))))]
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 5.0, 20.0])
+@pytest.mark.parametrize(("noise_m", "sd_m"), [(2.0, 2.0), (2.0, None), (2.0, 0.01), (0.3, 0.05)])
+def test_noise_raises_no_doubt(rate_hz: float, noise_m: float, sd_m: float | None) -> None:
+    time_s = np.arange(0.0, 600.0, 1.0 / rate_hz)
+    noise = np.random.default_rng(4).normal(0.0, noise_m, (len(time_s), 3))
+    assert not [*check_spikes(motion(time_s, driven(time_s) + noise, sd_m))]
+
+
+def test_a_jump_that_stays_and_coarse_numbers_raise_no_doubt() -> None:
+    time_s = np.arange(0.0, 60.0, 0.1)
+    position_m = driven(time_s)
+    position_m[300:] += np.array([4.0, 0.0, 0.0])  # another solution of the ambiguities
+    assert not [*check_spikes(motion(time_s, position_m))]
+    assert not [*check_spikes(motion(time_s, np.round(driven(time_s) / 1.1) * 1.1, None))]
