@@ -21,6 +21,7 @@ from kgcp.georef.target_positions import TargetPositions
 from kgcp.georef.trajectory import Trajectory
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
+from kgcp.io.formats.frame_times import FrameTimes
 from kgcp.io.images.exif import read_frame_header
 from kgcp.io.images.remote import StoredFolder, at_hand
 from kgcp.quality.checks.calibration import check_camera
@@ -134,10 +135,15 @@ class FlightInputs:
             return {
                 header.frame: header.time_s for header in self.headers if header.time_s is not None
             }
-        frames, times = set(self.frames), self._read(lambda: self.data.frame_times)
-        if times is None:
+        if self._file_times is None:
             return {}
-        return {frame: time_s for frame, time_s in times.time_s.items() if frame in frames}
+        frames, times = set(self.frames), self._file_times.time_s
+        return {frame: time_s for frame, time_s in times.items() if frame in frames}
+
+    @cached_property
+    def _file_times(self) -> FrameTimes | None:
+        """What the times file says; None: it cannot be read."""
+        return self._read(lambda: self.data.frame_times)
 
     @cached_property
     def trajectory(self) -> Trajectory | None:
@@ -273,7 +279,8 @@ class FlightInputs:
             offset_s = self.flight.vehicle.settings.time_offset_s
             frame_s = np.array([times[frame] for frame in sorted(times)])
             yield from check_overlap(frame_s, self.trajectory.time_s, offset_s)
-        if self.flight.vehicle is not None:
+        is_known = self.detected_s is not None or self._file_times is not None
+        if self.flight.vehicle is not None and is_known:
             is_by_header = self.detected_s is None and self.flight.times_file is None
             frames = [header.frame for header in self.headers] if is_by_header else self.frames
             yield from check_completeness(frames, times)

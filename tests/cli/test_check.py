@@ -115,6 +115,16 @@ def test_a_slip_is_named_with_its_remedy(
     assert result.exit_code == code
 
 
+@pytest.mark.parametrize("text", ["", "frame;time\n", "frame,time\nframe_0000.jpg,8:15\n"])
+def test_a_times_file_that_cannot_be_read_is_all_that_is_said(flight: Path, text: str) -> None:
+    (flight / "frames.csv").write_text(text, encoding="utf-8")
+    (doubt,) = json.loads(check(flight, "--json").stdout)["doubts"]
+    assert doubt["code"] == "unreadable"
+    result = CliRunner().invoke(main, ["detect", str(flight)], catch_exceptions=False)
+    assert result.exit_code == 1
+    assert "have no time" not in result.stderr
+
+
 def test_detect_prints_the_doubts_before_it_measures(flight: Path, tmp_path: Path) -> None:
     (flight / "frames").unlink()
     (flight / "frames").mkdir()
