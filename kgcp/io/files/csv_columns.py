@@ -54,7 +54,7 @@ class CsvColumns:
     numbers: FloatArray  # (n, len(names): their values, all finite
 
     def frames(self) -> tuple[str, ...]:
-        """Return the column frame with `/` between folders.
+        """Return the column frame, as `frame_name` writes it.
 
         Raises
         ------
@@ -63,7 +63,7 @@ class CsvColumns:
         """
         first_lines: dict[str, int] = {}
         for line, text in zip(self.lines, self.texts["frame"], strict=True):
-            frame = text.replace("\\", "/")
+            frame = frame_name(text)
             if not frame:
                 raise KgcpError(f"{self.path}, line {line}: names no frame; repair the line")
             if first_lines.setdefault(frame, line) != line:
@@ -97,6 +97,11 @@ class CsvColumns:
                 f" {block[row, column]:g}; a standard deviation is not negative"
             )
         return block
+
+
+def frame_name(text: str) -> str:
+    r"""Return a frame's name as `list_frames` has it: `./a\b.jpg` is `a/b.jpg`."""
+    return text.replace("\\", "/").removeprefix("./")
 
 
 def read_csv_columns(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from kgcp.errors import KgcpError
+from kgcp.io.files.csv_columns import frame_name
 from kgcp.io.files.safe_read import is_file, read_lines
 
 _COLUMNS = ("flight", "frame", "target")
@@ -64,7 +65,7 @@ def _exclusion(path: Path, line: int, columns: Sequence[str], cells: Sequence[st
             f"{path}, line {line}: has {len(cells)} cells; give a frame, or a frame and a target"
         )
     values = dict(zip(columns, cells, strict=False))
-    frame = values["frame"].replace("\\", "/") if "frame" in values else ""
+    frame = frame_name(values["frame"]) if "frame" in values else ""
     if not frame:
         raise KgcpError(f"{path}, line {line}: names no frame; repair or delete the line")
     return Exclusion(values.get("flight", ""), frame, values.get("target", ""))

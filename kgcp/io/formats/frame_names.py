@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import PurePosixPath
 
+from kgcp.io.files.csv_columns import frame_name
 from kgcp.io.files.sniff import ForeignFile
 
 _Key = Callable[[PurePosixPath], str]
@@ -74,7 +75,7 @@ def frames_of(file: ForeignFile, names: Sequence[str], frames: Sequence[str]) ->
         for key in {path.name, path.stem}:
             by_name[key].append(frame)
     for name in names:
-        frame = _frame_of(file, name.replace("\\", "/"), known, by_name)
+        frame = _frame_of(file, frame_name(name), known, by_name)
         if frame in owners:
             raise file.error(
                 f"images {owners[frame]!r} and {name!r} are both {frame!r}", "keep one of them"

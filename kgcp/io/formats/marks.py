@@ -9,7 +9,7 @@ from pathlib import Path
 from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera
 from kgcp.georef.plain_prediction import MarkedPlace
-from kgcp.io.files.csv_columns import read_csv_columns
+from kgcp.io.files.csv_columns import frame_name, read_csv_columns
 from kgcp.io.files.safe_read import is_file
 
 _TEXTS, _NUMBERS, _SD = ("frame", "target"), ("x_px", "y_px"), "sd_px"
@@ -49,7 +49,7 @@ def read_marks(
     marks: dict[str, dict[str, HandMark]] = {}
     rows = zip(table.lines, *(table.texts[name] for name in _TEXTS), places, sds, strict=True)
     for line, text, target, (x_px, y_px), sd_px in rows:
-        frame, where = text.replace("\\", "/"), f"{path}, line {line}"
+        frame, where = frame_name(text), f"{path}, line {line}"
         if frame not in frames:
             problem = f"{text!r} is no frame; write its path below the frames folder"
             raise KgcpError(f"{where}: {problem}")

@@ -171,9 +171,12 @@ def test_a_table_has_both_notations_and_may_have_more_columns(tmp_path: Path) ->
         "a.jpg,,1970-01-01T00:00:01.5Z",
         "",
         '"b,c\\d.jpg","x, y",2.25',
+        "./e.jpg,,3",
+        ".\\f\\g.jpg,,4",
         name="frames.csv",
     )
-    assert read_times(path, ()).time_s == {"a.jpg": 1.5, "b,c/d.jpg": 2.25}
+    times = {"a.jpg": 1.5, "b,c/d.jpg": 2.25, "e.jpg": 3.0, "f/g.jpg": 4.0}
+    assert read_times(path, ()).time_s == times
 
 
 @pytest.mark.parametrize(
@@ -184,6 +187,7 @@ def test_a_table_has_both_notations_and_may_have_more_columns(tmp_path: Path) ->
         ("frame,when\na.jpg,1\n", "line 1: lacks the columns time"),
         ("frame,time\na.jpg,1\na.jpg,2\n", r"line 3: frame 'a.jpg' stands in line 2 too"),
         ("frame,time\na.jpg\n", "line 2: has 1 cells, the first line has 2"),
+        ("frame,time\na.jpg,1\n./a.jpg,2\n", r"line 3: frame 'a.jpg' stands in line 2 too"),
         ("frame,time\n,1\n", "line 2: names no frame"),
         ("frame,time\na.jpg,\n", "line 2: time: '' is not a time"),
         ("frame,time\na.jpg,2026-05-04T09:30:05\n", "line 2: .* no time zone"),
