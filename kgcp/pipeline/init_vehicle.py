@@ -11,7 +11,7 @@ from kgcp.errors import SettingError
 from kgcp.georef.crs import WGS84_3D, longitude_latitude, parse_crs
 from kgcp.georef.crs_guess import is_geographic_place, projected_crs_near, utm_crs
 from kgcp.io.files.gps_time import TimeSystem, first_day_near
-from kgcp.io.files.time_text import NUMBER, parse_time
+from kgcp.io.files.time_text import NUMBER, half_of_time, names_zone, parse_time
 from kgcp.io.flight.folder import FolderContents
 from kgcp.io.flight.toml_draft import DraftKey
 from kgcp.io.formats.point_table import PointTable
@@ -206,10 +206,16 @@ def _of_times(
         elif named is TimeSystem.GPS:
             yield from _of_gps_seconds()
         return
+    if names_zone(start.time) is False:
+        yield from _of_zone(start.time, named)
+        return
     try:
         parse_time(start.time)
-    except SettingError:
-        yield from _of_zone(start.time, named)
+    except SettingError as error:
+        is_half = half_of_time(start.time) is not None
+        why = ": date and time seem to stand in two columns" if is_half else ""
+        remedy = f"{error.remedy}; then repeat kgcp init without this flight.toml"
+        yield Gap("trajectory", f"of its times, {error.problem}{why}", remedy)
 
 
 def _of_week(

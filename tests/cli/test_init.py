@@ -262,6 +262,27 @@ def test_seconds_in_a_column_of_gps_time_are_assumed_to_be_gps_time(
     assert 'or write time_system = "utc"' in said
 
 
+@pytest.mark.parametrize(
+    ("head", "cells", "words"),
+    [
+        ("Datum;Uhrzeit", "2026-06-16;08:15:00.5", "'2026-06-16' is a date without a time of day"),
+        ("Datum;Uhrzeit", "16.06.2026;08:15:00", "'16.06.2026' is a date without a time of day"),
+        ("Date;Time", "2026-06-16;08:15:00.5", "'08:15:00.5' is a time of day without a date"),
+    ],
+)
+def test_date_and_time_in_two_columns_are_to_be_joined(
+    bare: Path, tmp_path: Path, head: str, cells: str, words: str
+) -> None:
+    folder = copied(bare, "dji", tmp_path)
+    (folder / "rover.pos").unlink()
+    rows = f"{head};E;N;H\n{cells};689432.0;5336173.0;545.6\n"
+    (folder / "track.csv").write_text(rows, encoding="utf-8")
+    said = " ".join(init(folder, *TARGET, *ARM, "--crs", "EPSG:25832").stderr.split())
+    assert f"{words}: date and time seem to stand in two columns" in said
+    assert "join date and time in one column, as 2026-05-04T09:30:05.25Z" in said
+    assert "time_system" not in said
+
+
 def test_longitude_and_latitude_in_a_table(bare: Path, tmp_path: Path) -> None:
     folder = copied(bare, "dji", tmp_path)
     (folder / "rover.pos").unlink()

@@ -14,6 +14,10 @@ _LATEST_S = datetime(9999, 12, 29, tzinfo=UTC).timestamp()
 NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
 """A decimal number, written out: neither nan nor inf, no underscores."""
 _GPS_WEEK = re.compile(r"\d{4}[\s:;/]+\d{1,6}(\.\d*)?")
+_DAY = re.compile(r"\d{1,4}([-./])\d{1,2}\1\d{1,4}")
+_CLOCK = re.compile(r"\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?Z?")
+JOINING = "join date and time in one column, as 2026-05-04T09:30:05.25Z"
+"""What to do with times in two columns."""
 _REMEDY = "give UTC as 2026-05-04T09:30:05.25Z or as Unix seconds"
 
 
@@ -46,6 +50,9 @@ def parse_time(text: str) -> float:
             f"{_REMEDY}; a trajectory may have the seconds alone, with [vehicle] date and"
             " time_system",
         )
+    half = half_of_time(text)
+    if half is not None:
+        raise SettingError("time", f"{text!r} is {half}", f"{JOINING}, or give Unix seconds")
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:
@@ -53,6 +60,23 @@ def parse_time(text: str) -> float:
     if moment.tzinfo is None:
         raise SettingError("time", f"{text!r} names no time zone", _REMEDY)
     return _in_calendar((moment - _EPOCH) / _SECOND, f"{text!r} is out of range")
+
+
+def half_of_time(text: str) -> str | None:
+    """Tell in words which half of a time is missing; None: neither, or it is no time at all."""
+    if _DAY.fullmatch(text):
+        return "a date without a time of day"
+    return "a time of day without a date" if _CLOCK.fullmatch(text) else None
+
+
+def names_zone(text: str) -> bool | None:
+    """Tell whether date and time in ISO 8601 have a time zone; None: the text is something else."""
+    if NUMBER.fullmatch(text) or half_of_time(text) is not None:
+        return None
+    try:
+        return datetime.fromisoformat(text).tzinfo is not None
+    except ValueError:
+        return None
 
 
 def date_of(unix_s: float) -> datetime:

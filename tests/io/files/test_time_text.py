@@ -33,7 +33,9 @@ def test_both_notations_are_read(text: str, expected: float) -> None:
     ("text", "words"),
     [
         ("2026-05-04T09:30:05", "no time zone"),
-        ("2026-05-04", "no time zone"),
+        ("2026-05-04", "a date without a time of day; join date and time in one column"),
+        ("04.05.2026", "a date without a time of day"),
+        ("09:30:05.25", "a time of day without a date"),
         ("2026-13-04T09:30:05Z", "not a time"),
         ("", "not a time"),
         ("nan", "not a time"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from kgcp.errors import KgcpError, SettingError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.files.gps_time import TimeSystem, clock_from_date, unix_from_clock, weekday
-from kgcp.io.files.time_text import NUMBER, parse_time
+from kgcp.io.files.time_text import NUMBER, names_zone, parse_time
 from kgcp.io.formats.trajectories.records import TrajectoryFileOptions
 
 
@@ -75,18 +74,14 @@ def _numbers(path: Path, lines: Sequence[int], texts: Sequence[str]) -> FloatArr
 
 
 def _clock_time(text: str, system: TimeSystem | None, where: str) -> float:
-    if system is not None and not NUMBER.fullmatch(text):
-        try:
-            zone = datetime.fromisoformat(text).tzinfo
-        except ValueError:
-            zone = None  # `parse_time` below reports what is wrong
-        if zone is None:
-            text = f"{text}Z"
-        elif system is TimeSystem.GPS:
-            raise KgcpError(
-                f"{where}: time {text!r} names a zone, but [vehicle] time_system is gps;"
-                " delete the zone, or time_system from flight.toml"
-            )
+    has_zone = names_zone(text)
+    if has_zone and system is TimeSystem.GPS:
+        raise KgcpError(
+            f"{where}: time {text!r} names a zone, but [vehicle] time_system is gps;"
+            " delete the zone, or time_system from flight.toml"
+        )
+    if has_zone is False and system is not None:
+        text = f"{text}Z"
     try:
         return parse_time(text)
     except SettingError as error:

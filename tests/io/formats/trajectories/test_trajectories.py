@@ -132,7 +132,8 @@ def test_times_are_of_the_clock_that_flight_toml_names(
     ("text", "notation", "words"),
     [
         ("2026-05-04T09:30:00Z", _notation(TimeSystem.GPS), "names a zone, but .* is gps"),
-        ("2026-05-04", _notation(TimeSystem.GPS), "not a time"),
+        ("2026-05-04", _notation(TimeSystem.GPS), "'2026-05-04' is a date without a time of day"),
+        ("04.05.2026 9:30", _notation(TimeSystem.UTC), "'04.05.2026 9:30' is not a time"),
         ("2026-05-04T09:30", _notation(), "no time zone"),
         ("120605.25", _notation(day=date(2026, 5, 4)), "give time_system under"),
         ("2026-05-04T09:30:00Z", _notation(TimeSystem.UTC, date(2026, 5, 4)), "delete date"),
