@@ -223,10 +223,11 @@ def _targets_section(
     blocks = tuple(
         _block(each, places.get(each.name), is_lost=each.name in lost) for each in targets
     )
+    trajectory = "no trajectory is recognised" if contents.unknown else "there is no trajectory"
     gap = Gap(
         "positions",
-        f"nothing says where {', '.join(lost)} {'is' if len(lost) == 1 else 'are'}: there is no"
-        " trajectory, and no table of surveyed points with that name",
+        f"nothing says where {', '.join(lost)} {'is' if len(lost) == 1 else 'are'}: {trajectory},"
+        " and no table of surveyed points with that name",
         "write position_m = [x, y, z] below the target, or put the vehicle's trajectory or a table"
         " with the columns name, x, y, z into the folder before kgcp init",
     )

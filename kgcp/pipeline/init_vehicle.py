@@ -27,6 +27,7 @@ _WORDS = {
 }
 _WEEK_S = 2e6  # seconds of a week are below, Unix seconds far above
 _SHOWN_CRS = 3
+_SHOWN_FILES = 5
 _CRS_REMEDY = "write crs = … into flight.toml: the CRS of the surveyed coordinates"
 _LEVER_ARM = "forward, right, down [m] to the target"
 
@@ -83,6 +84,14 @@ def _without_trajectory(contents: FolderContents) -> Iterator[Part]:
             "trajectory",
             f"several files may be it: {names}",
             "leave one of them in the folder, or fill in [vehicle]",
+        )
+    elif contents.unknown:
+        shown = ", ".join(contents.relative(path) for path in contents.unknown[:_SHOWN_FILES])
+        more = " …" if len(contents.unknown) > _SHOWN_FILES else ""
+        yield InitFinding(
+            "not recognised",
+            f"{shown}{more}; a table is a trajectory if its first line names time, x, y, z, or"
+            " longitude, latitude, height, in degrees and metres",
         )
 
 

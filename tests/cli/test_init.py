@@ -168,9 +168,12 @@ def test_frames_named_by_time_with_calibration_and_sbet(bare: Path, tmp_path: Pa
     assert "assumed: trajectory its times are GPS time" in said
 
 
-def test_exif_alone_gives_a_guess_that_check_keeps_naming(bare: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("height", ["Höhe", "U"])
+def test_exif_alone_gives_a_guess_that_check_keeps_naming(
+    bare: Path, tmp_path: Path, height: str
+) -> None:
     folder = copied(bare, "static", tmp_path)
-    rows = "Punkt;Rechtswert;Hochwert;Höhe\nT1;689432,0;5336173,0;545,6\n"
+    rows = f"Punkt;Rechtswert;Hochwert;{height}\nT1;689432,0;5336173,0;545,6\n"
     (folder / "points.csv").write_text(rows, encoding="utf-8")
     flight, _, said = made(folder, *TARGET)
     assert flight.is_camera_guessed
@@ -281,6 +284,35 @@ def test_date_and_time_in_two_columns_are_to_be_joined(
     assert f"{words}: date and time seem to stand in two columns" in said
     assert "join date and time in one column, as 2026-05-04T09:30:05.25Z" in said
     assert "time_system" not in said
+
+
+def test_east_north_up_are_a_place(bare: Path, tmp_path: Path) -> None:
+    folder = copied(bare, "dji", tmp_path)
+    (folder / "rover.pos").unlink()
+    rows = ["time,E,N,U"]
+    rows += [
+        f"{time_s},{x},{y},{z}"
+        for time_s, (x, y, z) in zip(
+            PLAN.trajectory.time_s.tolist(), PLAN.trajectory.position_map.tolist(), strict=True
+        )
+    ]
+    (folder / "track.csv").write_text("\n".join(rows), encoding="utf-8")
+    _, data, said = made(folder, *TARGET, *ARM, "--crs", "EPSG:25832")
+    assert place_errors_m(data) < 1e-5
+    assert "z = 'U'" in said
+
+
+def test_files_that_are_not_recognised_are_named(bare: Path, tmp_path: Path) -> None:
+    folder = copied(bare, "dji", tmp_path)
+    notes = folder / "notes.txt"
+    notes.write_text("Sunny, little wind\n", encoding="utf-8")
+    assert "not recognised" not in init(folder, *TARGET, *ARM).stderr
+    (folder / "flight.toml").unlink()
+    (folder / "rover.pos").unlink()
+    (folder / "track.csv").write_text("time,E(ft),N(ft),U(ft)\n1,2,3,4\n", encoding="utf-8")
+    said = " ".join(init(folder, *TARGET, *ARM).stderr.split())
+    assert "not recognised notes.txt, track.csv; a table is a trajectory if " in said
+    assert "nothing says where T1 is: no trajectory is recognised, and no table" in said
 
 
 def test_longitude_and_latitude_in_a_table(bare: Path, tmp_path: Path) -> None:

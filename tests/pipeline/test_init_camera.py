@@ -28,6 +28,7 @@ def guessed_fx(header: FrameHeader) -> object:
         targets=none,
         points=none,
         references=none,
+        unknown=none,
     )
     (table,) = camera_section(contents, [header]).blocks
     assert isinstance(table, DraftTable)

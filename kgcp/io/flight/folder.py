@@ -25,10 +25,10 @@ FLIGHT_TOML = "flight.toml"
 TARGETS_TOML = "targets.toml"
 """What `kgcp target` writes beside the sheets."""
 
-_DATA_SUFFIXES = frozenset(
-    {".csv", ".txt", ".pos", ".out", ".sbet", ".tum", ".dat", ".asc", ".mrk", ".yml", ".yaml"}
-    | {".xml", ".json", ".geojson", ".cam", ".opf"}
-)
+_TABLE_SUFFIXES = frozenset({".csv", ".txt", ".pos", ".out", ".sbet", ".tum", ".dat", ".asc"})
+_DATA_SUFFIXES = _TABLE_SUFFIXES | {
+    *(".mrk", ".yml", ".yaml", ".xml", ".json", ".geojson", ".cam", ".opf")
+}
 _EVENTS = "_events.pos"  # how RTKLIB names the file of its marks
 _ACCURACIES = "smrmsg"  # how POSPac's files of accuracies begin
 _POSE_COLUMNS = {
@@ -53,6 +53,7 @@ class FolderContents:
     targets: tuple[Path, ...]
     points: tuple[PointTable, ...]
     references: tuple[Path, ...]
+    unknown: tuple[Path, ...]  # tables or logs by their names, but of no known content
 
     def relative(self, path: Path) -> str:
         """Return a path as flight.toml names it."""
@@ -76,7 +77,10 @@ def survey_folder(folder: Path) -> FolderContents:
     found: dict[str, list[Path]] = {}
     trajectories, points = [], []
     for path in paths:
-        for kind, detail in _kinds_of(path):
+        kinds = _kinds_of(path)
+        if not kinds and path.suffix.lower() in _TABLE_SUFFIXES:
+            found.setdefault("unknown", []).append(path)
+        for kind, detail in kinds:
             found.setdefault(kind, []).append(path)
             if isinstance(detail, TrajectoryFile):
                 trajectories.append(detail)
@@ -95,6 +99,7 @@ def survey_folder(folder: Path) -> FolderContents:
         tuple(found.get("targets", ())),
         tuple(points),
         tuple(found.get("reference", ())),
+        tuple(found.get("unknown", ())),
     )
 
 

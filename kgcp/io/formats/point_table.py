@@ -18,7 +18,10 @@ _COLUMNS: Mapping[str, Sequence[str]] = {
     ),
     "x": ("x", "e", "east", "easting", "ostwert", "rechtswert", "longitude", "lon", "long"),
     "y": ("y", "n", "north", "northing", "nordwert", "hochwert", "latitude", "lat"),
-    "z": ("z", "h", "height", "alt", "altitude", "elevation", "up", "hoehe", "höhe", "ellheight"),
+    "z": (
+        *("z", "h", "u", "height", "alt", "altitude", "elevation", "up"),
+        *("hoehe", "höhe", "ellheight"),
+    ),
 }
 
 

@@ -27,7 +27,7 @@ _ANGLES: Mapping[str, Sequence[str]] = {
     "y": ("latitude", "lat", "breite", "phi"),
 }
 _HEIGHT = (
-    *("z", "h", "height", "alt", "altitude", "elevation", "up", "hell", "ellh", "ellheight"),
+    *("z", "h", "u", "height", "alt", "altitude", "elevation", "up", "hell", "ellh", "ellheight"),
     *("ellipsoidalheight", "heightell", "hoehe", "höhe", "ellipsoidhoehe", "hae"),
 )
 _DEVIATIONS: Mapping[str, Sequence[str]] = {
