@@ -52,6 +52,13 @@ def test_names_of_another_flight_are_an_error(unmeasured: SampleFlight) -> None:
     )
 
 
+def test_a_times_file_without_lines_is_an_error(unmeasured: SampleFlight) -> None:
+    (unmeasured.path / "frames.csv").write_text("frame,time\n", encoding="utf-8")
+    line = unmeasured.fails("detect", *FAST)
+    assert "frames.csv: names no frame; give a line with name and time for every frame" in line
+    assert not unmeasured.out.exists()
+
+
 def test_frames_without_a_line_have_no_time(unmeasured: SampleFlight) -> None:
     rewrite(unmeasured, lambda name: name.replace(".", "_x.") if name in FRAMES[:2] else name)
     result = unmeasured.run("detect", *FAST)

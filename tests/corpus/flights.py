@@ -117,7 +117,7 @@ TOMLS: Mapping[str, tuple[str | bytes, str]] = {
 # name: content of frames.csv, words of the one line
 TIMES_FILES: Mapping[str, tuple[str | bytes, str]] = {
     "empty times": ("", "is empty; its first line must name frame, time"),
-    "times without rows": ("frame,time\n", ""),
+    "times without rows": ("frame,time\n", "names no frame; give a line with name and time"),
     "times with a mark of order": ("\ufeff" + TIMES, ""),
     "times with ends of DOS": (TIMES.replace("\n", "\r\n"), ""),
     "times in UTF-16": (TIMES.encode("utf-16"), "is not text in UTF-8"),

@@ -78,7 +78,9 @@ def _read_csv(file: ForeignFile, frames: Sequence[str]) -> FrameTimes:
             times[frame] = parse_time(text)
         except SettingError as error:
             raise KgcpError(f"{file.path}, line {line}: {error}") from None
-    if times and frames and times.keys().isdisjoint(frames):
+    if frames and not times:
+        raise file.error("names no frame", "give a line with name and time for every frame")
+    if frames and times.keys().isdisjoint(frames):
         raise _no_common_name(file, [*times], frames)
     return FrameTimes(times, _rotations(columns, times))
 
