@@ -52,7 +52,7 @@ def command(
 
     with open_workspace(flight, out, (DETECTIONS,)) as workspace:
         the_flight = read_flight(workspace.flight)
-        bias = bias_study(the_flight, detections or workspace.out / DETECTIONS)
+        bias = bias_study(the_flight, workspace.detections(detections))
         print_doubts(bias.doubts)
         report = bias.write_report(
             workspace.out, reexpose=reexpose, stored_frames=workspace.frames_of(the_flight)

@@ -198,7 +198,7 @@ def _export_one(
 
     with open_workspace(flight, out, (DETECTIONS,)) as workspace:
         the_flight = read_flight(workspace.flight)
-        (made,) = _made([(the_flight, detections or workspace.out / DETECTIONS)], choice)
+        (made,) = _made([(the_flight, workspace.detections(detections))], choice)
         if flight_ids:
             made = replace(made, gcps=with_flight_name(made.gcps, the_flight.name))
         written = write_gcps(made, workspace.out)

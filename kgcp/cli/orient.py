@@ -140,7 +140,7 @@ def _orient_by_targets(
     options = OrientOptions(patterns, min_points, has_free_focal=free_focal)
     with open_workspace(flight, out, (DETECTIONS,)) as workspace:
         the_flight = read_flight(workspace.flight)
-        poses = orient_flight(the_flight, detections or workspace.out / DETECTIONS, options)
+        poses = orient_flight(the_flight, workspace.detections(detections), options)
         written = write_poses(poses, workspace.out)
     if as_json:
         import json

@@ -100,7 +100,7 @@ def command(
     options = PlaceOptions(targets, poses, min_frames, has_exact_poses=eo == "fixed")
     with open_workspace(flight, out, (DETECTIONS,)) as workspace:
         the_flight = read_flight(workspace.flight)
-        places = place_flight(the_flight, detections or workspace.out / DETECTIONS, options)
+        places = place_flight(the_flight, workspace.detections(detections), options)
         written = write_places(places, workspace.out, formats)
         older = not_renewed(workspace.out / EXPORTS, written)
     if as_json:

@@ -64,6 +64,22 @@ class Workspace:
             return None
         return self.stored_flight / flight.frames_folder.relative_to(self.flight).as_posix()
 
+    def detections(self, named: Path | None) -> Path:
+        """Return the table of detections: the named one, or that in the results' folder.
+
+        Raises
+        ------
+        KgcpError
+            If it is not there, but in the folder in which results usually are.
+        """
+        table, usual = self.out / DETECTIONS, self.flight / RESULTS_NAME / DETECTIONS
+        if named is None and not table.exists() and usual.exists():
+            raise KgcpError(
+                f"{table}: does not exist; name the table that lies in the flight's folder",
+                option=f"detections {usual}",
+            )
+        return named or table
+
     def named(self, text: object) -> str:
         """Return a path, or a text with paths, by the names that the user knows."""
         shown = str(text)

@@ -130,6 +130,26 @@ def test_the_summary_says_what_to_change_and_heeding_it_ends_it(folder: Path) ->
     assert json.loads(_export(folder, "--json").stdout)["advice"] == []
 
 
+@pytest.mark.parametrize("command", ["export-gcp", "bias-report", "place", "orient"])
+def test_another_results_folder_needs_the_table_of_detections(folder: Path, command: str) -> None:
+    out, table = folder / "other", folder / "kgcp" / "detections.parquet"
+    result = CliRunner().invoke(main, [command, str(folder), "--out", str(out)])
+    assert result.exit_code == 1
+    assert result.stderr == (
+        f"kgcp: error: {out / 'detections.parquet'}: does not exist; name the table that lies in"
+        f" the flight's folder (--detections {table})\n"
+    )
+
+
+def test_without_any_table_detections_are_to_be_made(folder: Path) -> None:
+    table = folder / "kgcp" / "detections.parquet"
+    _export(folder, "--out", str(folder / "other"), "--detections", str(table))
+    table.unlink()
+    arguments = ["export-gcp", str(folder), "--out", str(folder / "other")]
+    result = CliRunner().invoke(main, arguments)
+    assert "does not exist; run 'kgcp detect' on this flight first" in result.stderr
+
+
 def test_jumps_are_left_out_counted_and_may_be_kept(folder: Path) -> None:
     summary = json.loads(_export(folder, "--json").stdout)
     assert summary["skipped"] == {"distance_jump": 1}
