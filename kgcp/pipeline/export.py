@@ -22,7 +22,7 @@ from kgcp.io.exporters.weights import MARK_FLOOR_PX
 from kgcp.io.exporters.write import export
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
-from kgcp.io.tables.consistency import write_consistency
+from kgcp.io.tables.consistency import remove_consistency, write_consistency
 from kgcp.io.tables.detections import read_attempts
 from kgcp.io.tables.gcps import GCP_COLUMNS, gcp_row
 from kgcp.io.tables.parquet import write_table
@@ -214,6 +214,8 @@ def write_formats(points: MapPoints, formats: Sequence[str], folder: Path) -> li
 def write_gcps(gcp_set: GcpSet, folder: Path) -> list[Path]:
     """Write `kgcps.parquet` and, with reference poses, the files of the consistency.
 
+    Without reference poses, those of an earlier export are removed.
+
     Raises
     ------
     KgcpError
@@ -223,5 +225,6 @@ def write_gcps(gcp_set: GcpSet, folder: Path) -> list[Path]:
     table = folder / "kgcps.parquet"
     write_table(table, GCP_COLUMNS, map(gcp_row, gcp_set.gcps), {**about, "crs": gcp_set.crs})
     if gcp_set.consistency is None:
+        remove_consistency(folder)
         return [table]
     return [table, *write_consistency(folder, gcp_set.consistency, about)]

@@ -20,6 +20,7 @@ from kgcp.georef.gcp import (
 from kgcp.io.exporters.formats import DEFAULT_FORMATS
 from kgcp.io.exporters.points import MapPoints
 from kgcp.io.exporters.weights import MARK_FLOOR_PX
+from kgcp.io.tables.consistency import remove_consistency
 from kgcp.io.tables.gcps import GCP_COLUMNS, gcp_row
 from kgcp.io.tables.parquet import write_table
 from kgcp.pipeline.execution.threads import single_threaded
@@ -144,7 +145,7 @@ def export_merged(
 
 
 def write_merged(merged: MergedGcps, folder: Path) -> list[Path]:
-    """Write `kgcps.parquet` of all flights.
+    """Write `kgcps.parquet` of all flights, and remove the consistency of an earlier export.
 
     Raises
     ------
@@ -157,4 +158,5 @@ def write_merged(merged: MergedGcps, folder: Path) -> list[Path]:
     shared = {key: first[key] for key in ("schema_version", "version")}
     metadata = {**shared, "crs": merged.crs, "flights": json.dumps(about)}
     write_table(table, GCP_COLUMNS, map(gcp_row, merged.gcps), metadata)
+    remove_consistency(folder)
     return [table]

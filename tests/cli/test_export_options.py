@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -148,6 +149,23 @@ def test_without_any_table_detections_are_to_be_made(folder: Path) -> None:
     arguments = ["export-gcp", str(folder), "--out", str(folder / "other")]
     result = CliRunner().invoke(main, arguments)
     assert "does not exist; run 'kgcp detect' on this flight first" in result.stderr
+
+
+@pytest.mark.parametrize("flights", [1, 2])
+def test_the_consistency_of_an_earlier_export_does_not_stay(
+    folder: Path, tmp_path: Path, flights: int
+) -> None:
+    _export(folder)
+    files = [folder / "kgcp" / f"consistency.{suffix}" for suffix in ("json", "parquet")]
+    assert all(file.exists() for file in files)
+    (folder / "reference.csv").unlink()
+    others = []
+    if flights == 2:
+        others = [str(shutil.copytree(folder, tmp_path / "north")), "--out", str(folder / "kgcp")]
+        toml = tmp_path / "north" / "flight.toml"
+        toml.write_text('name = "north"\n' + toml.read_text(encoding="utf-8"), encoding="utf-8")
+    _export(folder, *others)
+    assert not any(file.exists() for file in files)
 
 
 def test_jumps_are_left_out_counted_and_may_be_kept(folder: Path) -> None:

@@ -39,12 +39,22 @@ def write_consistency(
     KgcpError
         If they cannot be written.
     """
-    summary, table = folder / "consistency.json", folder / "consistency.parquet"
+    summary, table = _paths(folder)
     text = json.dumps(_summary(found), indent=2, ensure_ascii=False, allow_nan=False)
     write_bytes(summary, f"{text}\n".encode())
     rows = (row_of(CONSISTENCY_COLUMNS, each) for each in found.discrepancies)
     write_table(table, CONSISTENCY_COLUMNS, rows, metadata)
     return summary, table
+
+
+def remove_consistency(folder: Path) -> None:
+    """Remove both files of an earlier export: they are not of the points that are written now."""
+    for path in _paths(folder):
+        path.unlink(missing_ok=True)
+
+
+def _paths(folder: Path) -> tuple[Path, Path]:
+    return folder / "consistency.json", folder / "consistency.parquet"
 
 
 def _summary(found: Consistency) -> dict[str, object]:
