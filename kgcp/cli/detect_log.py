@@ -257,9 +257,13 @@ def _about_times(summary: DetectionSummary) -> Iterator[str]:
         )
     if not_named:
         untimed = summary.frames_without_time
-        has = f"{untimed} of them have no time" if untimed else "they have EXIF's time"
+        they_have = "it has" if not_named == 1 else "they have"
+        if untimed and not_named > 1:
+            they_have = f"{untimed} of them {'has' if untimed == 1 else 'have'}"
+        which = "no" if untimed else "EXIF's"
         yield (
-            f"frames that the times file does not name: {not_named}; {has}: complete the file"
+            f"frames that the times file does not name: {not_named}; {they_have} {which} time:"
+            " complete the file"
             + (", or set [frames] exif_fallback = true" if untimed == not_named else "")
         )
     if summary.times_without_frame:

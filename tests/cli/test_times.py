@@ -71,6 +71,18 @@ def test_frames_without_a_line_have_no_time(unmeasured: SampleFlight) -> None:
     assert table["time_source"].to_list() == ["", "", *["times_file"] * 3]
 
 
+@pytest.mark.parametrize(
+    ("fallback", "words"), [(False, "it has no time: complete"), (True, "it has EXIF's time:")]
+)
+def test_one_frame_without_a_line(unmeasured: SampleFlight, *, fallback: bool, words: str) -> None:
+    rewrite(unmeasured, lambda name: "other.jpg" if name == FRAMES[0] else name)
+    if fallback:
+        unmeasured.edit(('times = "frames.csv"', 'times = "frames.csv"\nexif_fallback = true'))
+    stderr = unmeasured.run("detect", *FAST).stderr
+    assert f"frames that the times file does not name: 1; {words}" in stderr
+    assert fallback or "1 of 5 frames has no time, such as frame_0000.jpg" in stderr
+
+
 def test_exif_serves_where_it_is_asked_to(unmeasured: SampleFlight) -> None:
     rewrite(unmeasured, lambda name: name.upper() if name in FRAMES[:2] else name)
     unmeasured.edit(('times = "frames.csv"', 'times = "frames.csv"\nexif_fallback = true'))

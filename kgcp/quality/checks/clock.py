@@ -110,7 +110,8 @@ def check_completeness(frames: Sequence[str], times_s: Mapping[str, float]) -> I
     if not untimed:
         return
     figures = {"frames_without_time": float(len(untimed)), "frames": float(len(frames))}
-    sentence = f"{len(untimed)} of {len(frames)} frames have no time, such as {untimed[0]}"
+    have = "has" if len(untimed) == 1 else "have"
+    sentence = f"{len(untimed)} of {len(frames)} frames {have} no time, such as {untimed[0]}"
     remedy = "give [frames] times with one line per frame, named as below the frames folder"
     doubt = grave if len(untimed) == len(frames) else mild
     yield doubt(Cause.NO_TIMES, sentence, remedy, figures)
