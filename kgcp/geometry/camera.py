@@ -22,6 +22,7 @@ from kgcp.geometry.distortion import (
     distort_circles,
     distort_points,
     distort_slopes,
+    first_fold_r2,
     undistort_points,
 )
 from kgcp.settings import require_range
@@ -230,12 +231,13 @@ class Camera:
     def undistort(self, pixels: FloatArray) -> FloatArray:
         """Map raw pixels (n, 2) to normalised coordinates (n, 2).
 
-        Newton's method with the analytic Jacobian, to 1e-13; points that the distortion model
+        Newton's method with the analytic Jacobian, to 1e-13; pixels that the distortion model
         cannot reach (beyond its fold) come back as NaN.
         """
         normalised = np.empty(np.shape(pixels))
         places = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
-        undistort_points(self._lens, self._scale, places, normalised.reshape(-1, 2))
+        lens, found = self._lens, normalised.reshape(-1, 2)
+        undistort_points(lens, self._scale, first_fold_r2(lens), places, found)
         return normalised
 
     def distort_jacobian(self, normalised: FloatArray) -> FloatArray:

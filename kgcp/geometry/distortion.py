@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
 
-from kgcp.geometry._jit import compiled_if_often
+from kgcp.geometry._jit import compiled_if_often, interpreted
 from kgcp.geometry.arrays import FloatArray
 
 _MAX_NEWTON_STEPS = 30
 _NEWTON_TOLERANCE = 1e-8  # convergence is quadratic: the step leaves its square
+_FARTHEST = 4.0  # normalised radius, 76° off the axis: no ray beyond it from a lens that folds
+_RADII = np.linspace(0.0, _FARTHEST, 801)
+_STEPS = 128  # from the axis to a point, in search of the fold
 
 Lens = tuple[float, float, float, float, float, float, float, float]
 """k1, k2, p1, p2, k3, k4, k5, k6."""
@@ -31,6 +35,19 @@ def _radial(lens: Lens, r2: _Real) -> tuple[_Real, _Real]:
     slope_above = k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3)
     slope_below = k4 + r2 * (2.0 * k5 + 3.0 * r2 * k6)
     return factor, (slope_above - factor * slope_below) / below
+
+
+_radial_of_many = interpreted(_radial)  # the program itself takes one call per camera
+
+
+@lru_cache
+def first_fold_r2(lens: Lens) -> float:
+    """Return the squared radius at which the radial distortion turns back; infinite: nowhere."""
+    r2 = _RADII**2
+    factor, slope = _radial_of_many(lens, r2)
+    with np.errstate(all="ignore"):  # coefficients are any finite numbers
+        is_before = (factor > 0.0) & (factor + 2.0 * r2 * slope > 0.0)
+    return np.inf if is_before.all() else float(r2[np.argmin(is_before)])
 
 
 @compiled_if_often
@@ -55,6 +72,18 @@ def _slopes(lens: Lens, x: float, y: float) -> tuple[float, float, float]:
         2.0 * (slope * x * y + p1 * x + p2 * y),
         factor + 2.0 * slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x,
     )
+
+
+@compiled_if_often
+def _is_before_fold(lens: Lens, x: float, y: float) -> bool:
+    """Tell whether the distortion turns nowhere between the axis and a normalised point."""
+    if x * x + y * y > _FARTHEST * _FARTHEST:
+        return False
+    for k in range(1, _STEPS):
+        xx, xy, yy = _slopes(lens, x * k / _STEPS, y * k / _STEPS)
+        if xx * yy - xy * xy <= 0.0:
+            return False
+    return True
 
 
 @compiled_if_often
@@ -102,8 +131,14 @@ def distort_slopes(lens: Lens, scale: Scale, points: FloatArray, slopes: FloatAr
 
 
 @compiled_if_often
-def undistort_points(lens: Lens, scale: Scale, pixels: FloatArray, points: FloatArray) -> None:
-    """Invert `distort_points` by Newton's method, to 1e-13; NaN where it does not converge."""
+def undistort_points(
+    lens: Lens, scale: Scale, fold_r2: float, pixels: FloatArray, points: FloatArray
+) -> None:
+    """Invert `distort_points` by Newton's method, to 1e-13; NaN for pixels beyond the fold.
+
+    For these, it does not converge, or it does so where the distortion has turned: once, or twice.
+    Only points farther out than `fold_r2` need a test for the latter.
+    """
     fx, fy, cx, cy = scale
     for i in range(pixels.shape[0]):
         x = wanted_x = (pixels[i, 0] - cx) / fx
@@ -117,6 +152,7 @@ def undistort_points(lens: Lens, scale: Scale, pixels: FloatArray, points: Float
             step_y = (xx * off_y - xy * off_x) / determinant
             x, y = x - step_x, y - step_y
             if abs(step_x) <= _NEWTON_TOLERANCE and abs(step_y) <= _NEWTON_TOLERANCE:
-                is_found = True
+                is_upright = determinant > 0.0 and xx + yy > 0.0
+                is_found = is_upright and (x * x + y * y <= fold_r2 or _is_before_fold(lens, x, y))
                 break
         points[i, 0], points[i, 1] = (x, y) if is_found else (np.nan, np.nan)

@@ -135,6 +135,42 @@ def test_pixels_beyond_the_fold_are_nan_and_leave_the_others_alone() -> None:
     assert inside[0] < np.sqrt(2.0 / 3.0), "the branch that holds the optical axis"
 
 
+FOLDED = {
+    "one term": {"k1": -0.3},
+    "three terms": {"k1": -0.28, "k2": 0.07, "k3": -0.008},
+    "turned twice": {"k1": -0.5, "k2": 0.1},
+    "turned twice, far out": {"k1": -0.45, "k2": 0.09, "k3": -0.002},
+    "rational": {"k1": 0.6, "k2": 0.05, "k3": 0.001, "k4": 0.9, "k5": 0.2, "k6": 0.01},
+    "infinite": {"k1": -0.3, "k4": -0.4},
+}
+
+
+@pytest.mark.parametrize("tangential", [0.0, 2e-3])
+@pytest.mark.parametrize("lens", FOLDED)
+def test_every_ray_before_the_fold_is_found_and_no_other(lens: str, tangential: float) -> None:
+    plain = Camera(4000, 3000, 1800.0, 1790.0, 2010.0, 1490.0)
+    camera = replace(plain, p1=tangential, p2=-0.5 * tangential, **FOLDED[lens])
+    # rays from the axis outwards, up to where the distortion turns
+    radii, angles = np.arange(0.0, 4.0, 0.002), np.radians(np.arange(0.0, 360.0, 5.0))
+    directions = np.column_stack((np.cos(angles), np.sin(angles)))
+    rays = radii[:, None, None] * directions
+    slopes = camera.distort_jacobian(rays) / camera.mean_focal_px
+    is_before = np.logical_and.accumulate(np.linalg.det(slopes) > 1e-4)
+    before = rays[is_before]
+    pixels = camera.distort(before)
+    is_seen = np.all((pixels > -0.5) & (pixels < (3999.5, 2999.5)), axis=1)
+    np.testing.assert_allclose(camera.undistort(pixels[is_seen]), before[is_seen], atol=1e-6)
+
+    x, y = np.meshgrid(np.arange(0.0, 4000.0, 50.0), np.arange(0.0, 3000.0, 50.0))
+    found = camera.undistort(np.column_stack((x.ravel(), y.ravel())))
+    found = found[np.isfinite(found[:, 0])]
+    angle = np.degrees(np.arctan2(found[:, 1], found[:, 0])) % 360.0
+    reach = np.max(np.where(is_before, radii[:, None], 0.0), axis=0)
+    largest = np.interp(angle, np.append(np.degrees(angles), 360.0), np.append(reach, reach[0]))
+    assert len(found) > 100
+    assert (np.hypot(*found.T) <= largest + 0.03).all()
+
+
 def test_any_shape_of_points_is_kept() -> None:
     camera = LENSES["rational"]
     grid = np.stack(np.meshgrid(np.linspace(0.0, 1500.0, 5), np.linspace(0.0, 1000.0, 3)), axis=-1)
