@@ -13,7 +13,8 @@ from kgcp.measurement.records import Alternative, Measurement
 def with_preference(camera: Camera, measurement: Measurement, preference: float) -> Measurement:
     """Return a measurement whose χ² of the other pose is raised by a preference.
 
-    The poses change places if the other one is then the better one.
+    The poses change places if the other one is then the better one. The covariance contains how far
+    they are apart, by how probable the other one has become.
 
     Parameters
     ----------
@@ -24,17 +25,24 @@ def with_preference(camera: Camera, measurement: Measurement, preference: float)
     if other is None:
         return measurement
     ambiguity = other.ambiguity + preference
-    if ambiguity >= 0.0 or other.pose_cov is None or measurement.uncertainty is None:
+    if other.pose_cov is None or measurement.uncertainty is None:
         return replace(measurement, alternative=replace(other, ambiguity=max(ambiguity, 0.0)))
+    own_cov = measurement.uncertainty.pose_cov.copy()
+    own_cov[:3, :3] -= spread_over_both(measurement.pose, other.pose, other.ambiguity)
+    if ambiguity >= 0.0:
+        own_cov[:3, :3] += spread_over_both(measurement.pose, other.pose, ambiguity)
+        return replace(
+            measurement,
+            alternative=replace(other, ambiguity=ambiguity),
+            uncertainty=propagate(camera, measurement.pose, own_cov),
+        )
     pose_cov = other.pose_cov.copy()
     pose_cov[:3, :3] += spread_over_both(other.pose, measurement.pose, -ambiguity)
-    before = measurement.uncertainty.pose_cov.copy()
-    before[:3, :3] -= spread_over_both(measurement.pose, other.pose, other.ambiguity)
     return replace(
         measurement,
         pose=other.pose,
         centre_px=camera.project(other.pose.translation_m[None])[0],
         heading_deg=image_heading_deg(camera, other.pose),
-        alternative=Alternative(measurement.pose, -ambiguity, before),
+        alternative=Alternative(measurement.pose, -ambiguity, own_cov),
         uncertainty=propagate(camera, other.pose, pose_cov),
     )

@@ -6,11 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.georef.neighbouring_normals import preferences_of_neighbours
+from kgcp.measurement.adjustment.covariance import propagate, spread_over_both
 from kgcp.measurement.other_pose import with_preference
 from kgcp.measurement.records import (
     Alternative,
@@ -85,3 +88,59 @@ def test_the_poses_change_places_with_all_that_follows_from_them() -> None:
     assert held.pose is before.pose
     assert held.alternative is not None
     assert held.alternative.ambiguity == 0.0
+
+
+def plate_of_two_places(ambiguity: float) -> Measurement:
+    """A plate whose two poses are 11 cm apart, with the covariance that a fit reports."""
+    (seen,) = plate(3, is_sure=False).outcomes
+    assert isinstance(seen, Measurement)
+    apart_m = np.array([0.05, 0.0, 0.1])
+    other = Pose(seen.pose.mirrored().rotation, seen.pose.translation_m + apart_m)
+    pose_cov = COV.copy()
+    pose_cov[:3, :3] += spread_over_both(seen.pose, other, ambiguity)
+    return replace(
+        seen,
+        alternative=Alternative(other, ambiguity, OTHER_COV),
+        uncertainty=propagate(CAMERA, seen.pose, pose_cov),
+    )
+
+
+def assert_same(measurement: Measurement, expected: Measurement) -> None:
+    ours, theirs = measurement.uncertainty, expected.uncertainty
+    assert ours is not None
+    assert theirs is not None
+    np.testing.assert_allclose(ours.pose_cov, theirs.pose_cov, atol=1e-15)
+    np.testing.assert_allclose(ours.centre_cov_px2, theirs.centre_cov_px2, rtol=1e-6)
+    assert ours.sd_distance_m == pytest.approx(theirs.sd_distance_m)
+    assert measurement.alternative is not None
+    assert expected.alternative is not None
+    assert measurement.alternative.ambiguity == pytest.approx(expected.alternative.ambiguity)
+    assert measurement.alternative.pose_cov is not None
+    assert expected.alternative.pose_cov is not None
+    np.testing.assert_allclose(
+        measurement.alternative.pose_cov, expected.alternative.pose_cov, atol=1e-15
+    )
+
+
+@pytest.mark.parametrize("preference", [-8.9, -2.0, 0.0, 20.0])
+def test_the_covariance_follows_how_probable_the_other_pose_is(preference: float) -> None:
+    weighed = with_preference(CAMERA, plate_of_two_places(9.0), preference)
+    assert_same(weighed, plate_of_two_places(9.0 + preference))
+
+
+@given(st.floats(0.0, 9.9), st.floats(-30.0, 30.0), st.floats(-30.0, 30.0))
+def test_preferences_add_up(ambiguity: float, first: float, second: float) -> None:
+    assume(abs(abs(ambiguity + first) + second) > 1e-6)  # of equal poses, either is reported
+    before = plate_of_two_places(ambiguity)
+    twice = with_preference(CAMERA, with_preference(CAMERA, before, first), second)
+    is_turned = ambiguity + first < 0.0
+    # a preference is for the pose that is reported: once they have changed places, for the other
+    at_once = with_preference(CAMERA, before, first - second if is_turned else first + second)
+    assert twice.pose is at_once.pose
+    assert_same(twice, at_once)
+    for each in (twice, at_once):
+        assert each.uncertainty is not None
+        assert each.alternative is not None
+        assert each.alternative.pose_cov is not None
+        assert np.linalg.eigvalsh(each.uncertainty.pose_cov).min() > 0.0
+        assert np.linalg.eigvalsh(each.alternative.pose_cov).min() > 0.0
