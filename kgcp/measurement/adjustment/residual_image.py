@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from kgcp.measurement.adjustment.pixels import whole_plate
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.random_levels import needs_varying_levels
 from kgcp.measurement.adjustment.solver import predict
-from kgcp.measurement.adjustment.unknowns import adjust_with_streak
+from kgcp.measurement.adjustment.unknowns import adjust_with_streak, with_pose
 from kgcp.measurement.image_model.blur import Blur, variance_in_bins
 from kgcp.measurement.image_model.photometry import Tone, plateau_levels
 from kgcp.measurement.image_model.plate import circles_of
@@ -72,7 +72,8 @@ def residual_image_of(
     problem = fit_problem_of(grey, camera, target, pose)
     start = Parameters.of(pose, _blur_in_bins(blur_px, problem), first_levels(problem, pose))
     fit = adjust_with_streak(problem, start, moves=False)
-    if needs_varying_levels(fit):
+    # whether the light varies is decided by the covariance of a pose, which must be free for that
+    if needs_varying_levels(replace(fit, unknowns=with_pose(fit.unknowns))):
         is_binned = problem.tone is Tone.OF_BINS
         if is_binned:  # as in a measurement
             problem = finer_problem_of(grey, camera, target, pose)

@@ -109,6 +109,12 @@ def without_even_light(unknowns: Unknowns) -> Unknowns:
     return replace(unknowns, free=free, free_precision=unknowns.precision[free])
 
 
+def with_pose(unknowns: Unknowns) -> Unknowns:
+    """Return the unknowns of a fit whose pose does not move, with the pose among them."""
+    free = np.append(np.arange(6), unknowns.free)
+    return replace(unknowns, free=free, free_precision=unknowns.precision[free])
+
+
 def with_edge_tone(unknowns: Unknowns) -> Unknowns:
     """Return the unknowns of a fit whose levels vary, with the tone of edges among them."""
     free, precision = np.append(unknowns.free, int(Param.EDGE_TONE)), unknowns.precision.copy()

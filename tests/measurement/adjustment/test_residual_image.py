@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.residual_image import contours_px, residual_image_of
+from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.targets.layout import Target
 
 CONTRAST = 0.75 - 0.08  # of the fixture's frames
@@ -59,6 +60,33 @@ def test_a_pose_too_near_or_beside_shows_where(
     assert west.min() < -0.4, "ink of the model on the frame's white"
     assert east.max() > 0.4
     assert left.edge_noise > 0.1
+
+
+@pytest.mark.parametrize(
+    ("radius_px", "way_deg", "turn_deg"), [(9.0, 0.0, 0.0), (11.0, 40.0, 30.0)]
+)
+def test_slight_shade_on_a_small_ring_is_seen(
+    camera: Camera,
+    photograph: DrawFrame,
+    place_plate: PlacePlate,
+    radius_px: float,
+    way_deg: float,
+    turn_deg: float,
+) -> None:
+    """Of small rings, the covariance of the pose tells, although the pose is not adjusted here."""
+    rng = np.random.default_rng(round(turn_deg / 30.0))
+    centre_px = (200.0 + rng.uniform(), 170.0)
+    pose = place_plate(centre_px, radius_px, tilt_deg=20.0, way_deg=way_deg, turn_deg=turn_deg)
+
+    def shade(x: FloatArray, y: FloatArray) -> FloatArray:
+        across_px = 0.8 * (x - centre_px[0]) + 0.6 * (y - centre_px[1])
+        return np.asarray(1.0 - 0.08 / (1.0 + np.exp(-across_px / 2.0)))
+
+    grey = photograph(camera, pose, rng, shade=shade)
+    left = residual_image_of(grey, camera, TARGET_PLATE.target, pose, 0.8)
+    assert left.white is not None
+    assert 0.8 < np.nanmin(left.white) < 0.97
+    assert left.edge_noise < 0.02
 
 
 def test_contours_are_closed_and_distorted_as_the_camera_does(
