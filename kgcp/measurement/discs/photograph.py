@@ -159,7 +159,7 @@ def _are_in_one_row(points_m: FloatArray) -> bool:
     """Return whether points (k, 3) of a plane determine no homography: all but one in a row."""
     for left_out in range(len(points_m)):
         rest = np.delete(points_m, left_out, axis=0)
-        _, widths, _ = np.linalg.svd(rest - rest.mean(axis=0))
+        widths = np.linalg.svd(rest - rest.mean(axis=0), compute_uv=False)
         if widths[1] < _LEAST_WIDTH * widths[0]:
             return True
     return False

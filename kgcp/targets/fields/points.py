@@ -177,7 +177,7 @@ class PointField:
             raise SettingError(
                 "points", f"{names[0]} and {names[1]} overlap", "correct their places or diameters"
             )
-        widths = np.linalg.svd(centres - centres.mean(axis=0))[1]
+        widths = np.linalg.svd(centres - centres.mean(axis=0), compute_uv=False)
         if widths[1] < _LEAST_WIDTH * widths[0]:
             raise SettingError(
                 "points", "lie in one row, which does not determine a camera", "add some beside it"
