@@ -41,7 +41,7 @@ def check_targets(targets: Sequence[Target]) -> None:
 def same_shape(first: Ring, second: Ring) -> bool:
     """Whether two rings look alike but for their size and code."""
     pairs = zip(_proportions(first), _proportions(second), strict=True)
-    return all(abs(a - b) <= _SAME_SHAPE * b for a, b in pairs)
+    return all(abs(a - b) <= _SAME_SHAPE * max(a, b) for a, b in pairs)
 
 
 def codes_coincide(first: Ring, second: Ring) -> bool:

@@ -40,6 +40,13 @@ def test_shape_is_what_remains_without_size() -> None:
     assert not same_shape(ring(), Ring("B", 0.9, 0.3, 0.6, 0.12, CODE))
 
 
+@pytest.mark.parametrize(("inner_m", "is_same"), [(0.553, True), (0.559, False)])
+def test_shape_is_compared_alike_in_both_directions(inner_m: float, *, is_same: bool) -> None:
+    narrow = Ring("A", 1.0, 0.5, 0.72, 0.1, CODE)
+    wide = Ring("B", 1.0, inner_m, 0.72, 0.1, CODE)
+    assert same_shape(narrow, wide) is same_shape(wide, narrow) is is_same
+
+
 def test_a_replica_with_the_code_of_its_plate_is_refused() -> None:
     plate = ring()
     turned = tuple(angle + 90.0 for angle in CODE)
