@@ -175,14 +175,17 @@ class Camera:
 
     def binned(self, count: int) -> Camera:
         """Return the camera whose pixels are squares of `count` by `count` of this one's."""
+        height = self.height // count
         return replace(
             self,
             width=self.width // count,
-            height=self.height // count,
+            height=height,
             fx=self.fx / count,
             fy=self.fy / count,
             cx=(self.cx - 0.5 * (count - 1)) / count,
             cy=(self.cy - 0.5 * (count - 1)) / count,
+            # from the middle of the first bins to that of the last ones
+            readout_s=self.readout_s * count * (height - 1) / (self.height - 1),
         )
 
     @property

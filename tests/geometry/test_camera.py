@@ -180,6 +180,16 @@ def test_any_shape_of_points_is_kept() -> None:
     )
 
 
+@pytest.mark.parametrize("count", [2, 3, 4, 8])
+def test_bins_see_the_same_rays_at_the_same_times(count: int) -> None:
+    camera = replace(LENSES["rational"], width=1608, height=1104, readout_s=0.03)
+    bins = np.array([[0.0, 0.0], [131.0, 20.0], [200.0, 137.0]])
+    pixels = count * bins + 0.5 * (count - 1)
+    binned = camera.binned(count)
+    np.testing.assert_allclose(binned.undistort(bins), camera.undistort(pixels), atol=1e-12)
+    np.testing.assert_allclose(binned.delay_s(bins), camera.delay_s(pixels), atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("key", "value"),
     [("fx", 0.0), ("fy", -1.0), ("width", 1), ("cx", 5000.0), ("cy", float("nan")),
