@@ -10,8 +10,14 @@ from numpy.polynomial import chebyshev
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 
-FRAME_ORDER = 15  # undistortion is smooth: 1e-10 px over a whole frame of usual lenses
-WINDOW_ORDER = 7  # the same over a window of some hundred pixels
+# Nodes along each axis. Errors over a whole frame: 4e-11 px for the lens of the tests, 2e-6 px with
+# f = 3700 px in a frame of 5472 px, 6e-4 px with f = 2300 px in one of 4000 px (k1 -0.14, k2 0.12,
+# k3 -0.03).
+FRAME_ORDER = 15
+# Over windows of 950 px anywhere in these frames: 2e-9, 3e-10 and 2e-7 px; with 7 nodes, 4e-4 px.
+# Only where the distortion nearly folds, 3 % beyond a corner, it is 4e-3 px there, and 1e-5 px over
+# windows of 330 px. The time, 30 µs more than with 7 nodes, does not count in a measurement.
+WINDOW_ORDER = 11
 
 
 @cache
@@ -38,7 +44,7 @@ def normalised_grid(
     """Undistort a whole grid of pixel positions at once.
 
     `Camera.undistort` is evaluated on Chebyshev nodes of the grid's rectangle, and the
-    interpolating polynomial on the grid: the same to 1e-9 px, some hundred times faster.
+    interpolating polynomial on the grid: nearly the same, some hundred times faster.
 
     Parameters
     ----------
@@ -61,6 +67,8 @@ def normalised_grid(
 def rays_of_window(camera: Camera, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
     """Undistort a small grid, with derivatives.
 
+    Pixels beyond the fold of the lens are NaN.
+
     Parameters
     ----------
     camera, x_px, y_px
@@ -74,13 +82,21 @@ def rays_of_window(camera: Camera, x_px: FloatArray, y_px: FloatArray) -> FloatA
     """
     x_nodes, columns = _interpolator(x_px, WINDOW_ORDER)
     y_nodes, rows = _interpolator(y_px, WINDOW_ORDER)
-    nodes = np.empty((WINDOW_ORDER, WINDOW_ORDER, 2))
-    nodes[..., 0], nodes[..., 1] = x_nodes, y_nodes[:, None]
-    at_nodes = camera.undistort(nodes)
-    fields = np.empty((6, WINDOW_ORDER, WINDOW_ORDER))
-    fields[0], fields[1] = at_nodes[..., 0], at_nodes[..., 1]
-    _fill_inverse(camera.distort_jacobian(at_nodes), fields[2:])
+    fields = _rays(camera, x_nodes, y_nodes)
+    if np.isnan(fields).any():  # one node that the lens cannot reach would spoil all pixels
+        return _rays(camera, x_px, y_px).reshape(6, -1)
     return np.asarray((rows @ fields @ columns.T).reshape(6, -1))
+
+
+def _rays(camera: Camera, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+    """Return the rays (6, n, m) of a grid of pixels, as `rays_of_window`, one by one."""
+    pixels = np.empty((len(y_px), len(x_px), 2))
+    pixels[..., 0], pixels[..., 1] = x_px, y_px[:, None]
+    normalised = camera.undistort(pixels)
+    fields = np.empty((6, len(y_px), len(x_px)))
+    fields[0], fields[1] = normalised[..., 0], normalised[..., 1]
+    _fill_inverse(camera.distort_jacobian(normalised), fields[2:])
+    return fields
 
 
 def _fill_inverse(matrix: FloatArray, inverse: FloatArray) -> None:

@@ -52,6 +52,27 @@ def test_a_window_is_undistorted_like_its_pixels(x_px: FloatArray, y_px: FloatAr
         np.testing.assert_allclose(from_px[:, axis].T, numeric, rtol=0.0, atol=1e-9)
 
 
+@pytest.mark.parametrize("corner_px", [(0.0, 0.0), (1500.0, 0.0), (3049.0, 2049.0)])
+def test_large_windows_of_wide_lenses_are_undistorted_like_their_pixels(
+    corner_px: tuple[float, float],
+) -> None:
+    camera = Camera(4000, 3000, 2300.0, 2300.0, 2000.0, 1500.0, k1=-0.14, k2=0.12, k3=-0.03)
+    x_px, y_px = (start + np.arange(950.0) for start in corner_px)
+    rays, pixels = rays_of_window(camera, x_px, y_px)[:2].T[::37], pixels_of(x_px, y_px)[::37]
+    np.testing.assert_allclose(camera.distort(rays), pixels, rtol=0.0, atol=1e-6)
+
+
+def test_pixels_beyond_the_fold_leave_the_rest_of_their_window_alone() -> None:
+    """With k1 = -0.3 rays end 632 px from the principal point, in the corner of this window."""
+    camera = Camera(2000, 1500, 900.0, 900.0, 1000.0, 750.0, k1=-0.3)
+    x_px, y_px = 1400.0 + np.arange(90.0), 1150.0 + np.arange(80.0)
+    rays, exact = rays_of_window(camera, x_px, y_px), camera.undistort(pixels_of(x_px, y_px))
+    assert 0.5 < np.isfinite(exact).mean() < 0.95
+    np.testing.assert_array_equal(rays[:2].T, exact)
+    slopes = np.linalg.inv(camera.distort_jacobian(exact)).reshape(-1, 4)
+    np.testing.assert_allclose(rays[2:].T, slopes, rtol=1e-9)
+
+
 def test_a_whole_frame_is_undistorted_like_its_pixels() -> None:
     x_px, y_px = np.arange(-0.5, 1600.0, 40.0), np.arange(-0.5, 1100.0, 40.0)
     x, y = normalised_grid(CAMERA, x_px, y_px)
