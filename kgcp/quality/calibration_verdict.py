@@ -21,6 +21,7 @@ from kgcp.quality.frame_rays import ray_deviations_px
 
 _CELLS = (8, 6)  # of the frame, that discs cover or do not
 _LEAST_PLACES = 4
+_ADVISED_PLACES = 12
 _LEAST_DISCS = 6  # per photograph
 _MOST_REJECTED = 0.1
 _FOCAL_SHARE = 0.01
@@ -242,7 +243,7 @@ def _unusable(calibration: CameraCalibration, numbers: CalibrationNumbers) -> It
     elif numbers.places < _LEAST_PLACES:
         yield f"{numbers.photographs} only, fewer than {_LEAST_PLACES}"
     if numbers.discs_used < _LEAST_DISCS * numbers.views:
-        yield "there are fewer than 6 discs per photograph"
+        yield f"there are fewer than {_LEAST_DISCS} discs per photograph"
     rejected = 1.0 - numbers.discs_used / numbers.discs
     if rejected > _MOST_REJECTED:
         yield f"{100.0 * rejected:.0f} % of the discs do not fit"
@@ -258,8 +259,11 @@ def _unusable(calibration: CameraCalibration, numbers: CalibrationNumbers) -> It
 
 def _more_photographs(numbers: CalibrationNumbers) -> str:
     if numbers.places == numbers.views:
-        return "Take 12 photographs or more."
-    return f"Take photographs from 12 places or more: a burst counts once ({numbers.photographs})."
+        return f"Take {_ADVISED_PLACES} photographs or more."
+    return (
+        f"Take photographs from {_ADVISED_PLACES} places or more: a burst counts once"
+        f" ({numbers.photographs})."
+    )
 
 
 def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iterator[str]:
@@ -352,7 +356,7 @@ def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
             " field rigid. If those that do not fit are the only ones to reach the corners, it may"
             " be a lens that no model here describes."
         )
-    if numbers.places < 12:
+    if numbers.places < _ADVISED_PLACES:
         yield _more_photographs(numbers)
     if calibration.undetermined:
         names = ", ".join(calibration.undetermined)
@@ -367,8 +371,8 @@ def _field_advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -
         yield "Mount the sheet on a stiff plate, or let it lie and move the camera."
     if _has_other_discs(calibration):
         yield (
-            "Measure the diameter and the pitch of the print, on which the camera does not depend;"
-            " burnt white displaces edges, too."
+            "Measure the diameter and the pitch of the print; the camera does not depend on them."
+            " Burnt white also displaces edges."
         )
     if calibration.is_turn_unclear:
         yield "Give the field a mark: one disc that is hollow, larger or missing."
