@@ -23,7 +23,8 @@ from kgcp.errors import KgcpError
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 _FOR_READING = 0, 3, 1  # LLVM's prefetch: to read, into the nearest cache, of data
-_SPARED_CALLS = 100_000  # by Python take as long as loading numba and its tables: 0.5 s
+# So many calls by Python take as long as loading numba and its tables: 0.5 s.
+_CALLS_BEFORE_COMPILING = 100_000
 
 
 class _Compilable:
@@ -41,7 +42,7 @@ class _Compilable:
         update_wrapper(self, function)
 
     def __call__(self, *args: Any) -> Any:  # noqa: ANN401 - those of the function
-        """Call the function."""
+        """Call the compiled function, and compile it if this is the first call."""
         dispatcher = self._dispatcher or self.dispatcher()
         return dispatcher(*args)
 
@@ -79,15 +80,15 @@ class _Compilable:
         return self._dispatcher
 
 
-class _Spared(_Compilable):
+class _CompiledIfOften(_Compilable):
     """A function that Python runs until numba is loaded, or there are many calls."""
 
-    calls_left = _SPARED_CALLS  # of all such functions together
+    calls_left = _CALLS_BEFORE_COMPILING  # of all such functions together
 
     def __call__(self, *args: Any) -> Any:  # noqa: ANN401 - those of the function
-        """Call the function."""
-        if _Spared.calls_left > 0 and "numba" not in sys.modules:
-            _Spared.calls_left -= 1
+        """Call the function as Python runs it, or compiled once there were many calls."""
+        if _CompiledIfOften.calls_left > 0 and "numba" not in sys.modules:
+            _CompiledIfOften.calls_left -= 1
             return self.interpreted(*args)
         return super().__call__(*args)
 
@@ -136,7 +137,7 @@ def compiled_if_often(function: _Function) -> _Function:
 
     Sums, differences, products and quotients alone: of these, Python makes the same bits.
     """
-    return cast("_Function", _Spared(function))
+    return cast("_Function", _CompiledIfOften(function))
 
 
 def interpreted(function: _Function) -> _Function:

@@ -12,4 +12,4 @@ ComplexArray = npt.NDArray[np.complex128]
 SingleArray = npt.NDArray[np.float32]
 IndexArray = npt.NDArray[np.intp]
 BoolArray = npt.NDArray[np.bool_]
-GreyArray = npt.NDArray[Any]  # uint8, uint16 or float: one channel, (height, width)
+GreyArray = npt.NDArray[Any]  # (height, width): uint8, uint16, or floats with 1 at full scale

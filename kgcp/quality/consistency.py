@@ -15,7 +15,7 @@ from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.quality.consistency_equations import Meeting, System
-from kgcp.quality.corrections import UNKNOWN_LIMITS, CorrectionEstimate, estimate
+from kgcp.quality.corrections import UNKNOWN_LIMITS, CorrectionEstimate, estimate_corrections
 from kgcp.quality.robust_gls import ErrorModel, find_outliers, whitened_products
 from kgcp.settings import VehicleSettings
 
@@ -128,7 +128,7 @@ def _adjust(
     trials = []
     for correlation_s in _CORRELATIONS_S:
         products, log_det = whitened_products(columns, errors, correlation_s)
-        fitted = estimate(products, 3 * len(columns), has_sds=equations.has_sds)
+        fitted = estimate_corrections(products, 3 * len(columns), has_sds=equations.has_sds)
         misfit = fitted.chi2_after
         if not equations.has_sds:  # the likeliest scale is part of the likelihood
             misfit = 3 * len(columns) * math.log(misfit)

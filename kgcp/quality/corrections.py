@@ -79,7 +79,7 @@ class CorrectionEstimate:
         return self.chi2_after / self.degrees_of_freedom
 
 
-def estimate(products: FloatArray, count: int, *, has_sds: bool) -> CorrectionEstimate:
+def estimate_corrections(products: FloatArray, count: int, *, has_sds: bool) -> CorrectionEstimate:
     """Estimate the corrections from weighted products.
 
     Parameters

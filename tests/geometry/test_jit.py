@@ -41,13 +41,13 @@ def test_few_points_are_distorted_without_numba_to_the_same_bits(
 ) -> None:
     points = np.random.default_rng(1).normal(0.0, 0.5, (40, 2))
     points[:3] = (0.0, 0.0), (30.0, 40.0), (np.nan, 1.0)
-    monkeypatch.setattr(_jit._Spared, "calls_left", 0)
+    monkeypatch.setattr(_jit._CompiledIfOften, "calls_left", 0)
     compiled = there_and_back(distortion, points)
     copy = fresh_copy(distortion)
     monkeypatch.delitem(sys.modules, "numba", raising=False)
-    monkeypatch.setattr(_jit._Spared, "calls_left", 10_000)
+    monkeypatch.setattr(_jit._CompiledIfOften, "calls_left", 10_000)
     interpreted = there_and_back(copy, points)
-    assert 0 < _jit._Spared.calls_left < 10_000
+    assert 0 < _jit._CompiledIfOften.calls_left < 10_000
     for ours, numbas in zip(interpreted, compiled, strict=True):
         np.testing.assert_array_equal(ours, numbas)
     assert np.isnan(interpreted[1]).any()

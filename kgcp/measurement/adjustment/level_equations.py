@@ -49,7 +49,7 @@ class LevelEquations:
     """The equations of one linearisation, the levels eliminated."""
 
     scaled: FloatArray  # (p, n): Jacobian by all else, in units of the noise
-    normal: FloatArray  # (p, p): n, priors included
+    normal: FloatArray  # (p, p): normal matrix, priors included
     at_knots: AtKnots
     # (2, n): derivatives by the levels of ink and of plate, in units of the noise
     by_level: FloatArray

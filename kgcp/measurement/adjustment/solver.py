@@ -68,7 +68,7 @@ class TargetFit:
     sample: Sample
     parameters: Parameters
     prediction: PredictedImage
-    jacobian: FloatArray  # (21, n): as of `PhotometricModel.linearised`
+    jacobian: FloatArray  # (rows, n): as of `PhotometricModel.linearised`
     sd: FloatArray  # (n,): noise of every pixel, as level
     misfit: Misfit  # without the priors
     unknowns: Unknowns
@@ -198,7 +198,7 @@ def _fit_with_noise(
     least_gain: float,
     is_near: bool,
 ) -> TargetFit:
-    """Minimise until the noise of the residuals is the one that they were weighted with.
+    """Minimise, and weight residuals by their own noise, until that no longer changes.
 
     From a start that is near, the noise shows before the minimum is reached, and the first
     minimisation may stop early. Elsewhere it might then go to a wrong minimum.

@@ -40,7 +40,7 @@ in its dirt have 20 at most. Of 24 rings in dirt behind a bilateral filter (R â‰
 fits over both bases have 200 and more. Wrong bases of the curve ask for it, too, less than that.
 """
 _EDGE_TONE_SD = 0.15  # with 0.5, errors under highlights are twice as large
-# Of burnt plates of unknown tone: without a prior, white and tone would drift together.
+# Prior of the white where tone is free: on burnt plates, the two would drift together without it.
 _WHITE, _WHITE_SD = 1.0, 0.4
 _ALWAYS = [*range(6), Param.BLUR_MEAN, Param.BLACK, Param.WHITE, Param.SLOPE_X, Param.SLOPE_Y]
 _GAUSSIAN = [Param.BLUR_DIFFERENCE, Param.BLUR_XY]

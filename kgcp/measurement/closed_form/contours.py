@@ -1,4 +1,4 @@
-"""Edges and their contours in one frame, broken ones closed: §2.1 of Cucci (2016)."""
+"""Edges of one frame as contours, and hulls of those that dots break: §2.1 of Cucci (2016)."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ class Contours:
 
     def chosen(self, indices: IndexArray) -> Contours:
         """Contours of the given indices (k,) alone."""
-        return repair_contours([self.contour(int(index)) for index in indices])
+        return joined_contours([self.contour(int(index)) for index in indices])
 
 
-def repair_contours(contours: Sequence[npt.NDArray[Any]]) -> Contours:
-    """Put contours, each (k, 2), end to end."""
+def joined_contours(contours: Sequence[npt.NDArray[Any]]) -> Contours:
+    """Return contours, each (k, 2), in one record, end to end."""
     starts = np.zeros(len(contours) + 1, dtype=np.intp)
     np.cumsum([len(contour) for contour in contours], out=starts[1:])
     points = np.concatenate(contours) if contours else np.zeros((0, 2))
@@ -69,7 +69,7 @@ def find_contours(grey: GreyArray, settings: DetectSettings) -> Contours:
     contours, _ = cv2.findContours(edges, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     # A digital circle has at least 4 √2 pixels per pixel of radius.
     shortest = max(6, int(4.0 * np.sqrt(2.0) * settings.min_radius_px))
-    return repair_contours([contour[:, 0] for contour in contours if len(contour) >= shortest])
+    return joined_contours([contour[:, 0] for contour in contours if len(contour) >= shortest])
 
 
 def circular_hulls(contours: Contours, settings: DetectSettings) -> list[FloatArray]:

@@ -45,7 +45,7 @@ COUNT = 21
 GEOMETRY_COUNT = 5
 _OF_SHARE = np.array([0, 1, 2, 3, 4, 6, 7, 8])  # rows of a white share's Jacobian
 _FILTERED = np.array([Row.BLACK, Row.WHITE, *range(Row.BLACK), Row.SLOPE_X, Row.SLOPE_Y])
-_BESIDE = 10  # levels about a pixel, their derivatives by light, and by the waves
+_LEVEL_ROWS_PER_PIXEL = 10  # of ink and plate, their derivatives by light, and by the waves
 _MOST_LIGHT, _STEPS = 4.0, 1 << 16  # of the table of sRGB's curve
 _WAVES = np.array([Row.WAVE_1, Row.WAVE_2, Row.WAVE_3])
 CURVES = np.array([Row.CURVE_XX, Row.CURVE_XY, Row.CURVE_YY])
@@ -70,7 +70,7 @@ class LevelModel:
         """
         count = len(share.value)
         value, jacobian = np.empty(count), np.zeros((COUNT, count))
-        beside = np.zeros((_BESIDE, count if self.mask is not None else 0))
+        beside = np.zeros((_LEVEL_ROWS_PER_PIXEL, count if self.mask is not None else 0))
         of_tone = (self.tone.is_srgb, self.tone.is_shaped)
         _expose(
             share.value,

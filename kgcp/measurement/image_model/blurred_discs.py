@@ -39,7 +39,7 @@ _EDGE = float(Quadrature.EDGE)
 _SHORT_SMEAR = 0.2  # of the blur: below, differences of the profile lose their digits
 _SHORTEST_SMEAR = 0.01  # of the blur: chords cannot tell a shorter one from none
 _SHORTEST_STREAK = 0.1  # of the blur: below, it has no direction
-_NOWHERE_M = 1e-12  # keeps directions finite in a circle's centre
+_LEAST_DISTANCE_M = 1e-12  # keeps directions finite in a circle's centre
 _PER_ROOT_2PI = 1.0 / math.sqrt(2.0 * math.pi)
 _BATCH = 16  # pixels: two to four full vectors, and all rows stay in the first-level cache
 # rows of a batch: where on the plate from the circle's centre, and how the blur lies there …
@@ -145,7 +145,7 @@ def _add_straight(w: FloatArray, radius: float, smears: bool, only_level: bool) 
     """
     bend = 0.5 / radius
     for j in range(_BATCH):
-        rho = math.sqrt(w[_X + j] * w[_X + j] + w[_Y + j] * w[_Y + j]) + _NOWHERE_M
+        rho = math.sqrt(w[_X + j] * w[_X + j] + w[_Y + j] * w[_Y + j]) + _LEAST_DISTANCE_M
         per_rho = 1.0 / rho
         x, y = w[_X + j] * per_rho, w[_Y + j] * per_rho
         radial, across, mixed = _turned(x, y, w[_XX + j], w[_XY + j], w[_YY + j])
@@ -189,7 +189,7 @@ def _add_chords(w: FloatArray, radius: float, rule: int, smears: bool, only_leve
         dx, dy = w[_X + j], w[_Y + j]
         u, v = (w[_STREAK_X + j], w[_STREAK_Y + j]) if smears else (dx, dy)
         length = math.sqrt(u * u + v * v)
-        u, v = u / (length + _NOWHERE_M), v / (length + _NOWHERE_M)
+        u, v = u / (length + _LEAST_DISTANCE_M), v / (length + _LEAST_DISTANCE_M)
         along, across, mixed = _turned(u, v, w[_XX + j], w[_XY + j], w[_YY + j])
         sd = math.sqrt(max(along - mixed * mixed / across, 1e-6 * along))
         w[_U + j], w[_V + j] = u, v

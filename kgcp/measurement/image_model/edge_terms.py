@@ -42,7 +42,7 @@ _X, _Y, _X_RIGHT, _X_DOWN, _Y_RIGHT, _Y_DOWN, *_OTHERS = range(0, 14 * _BATCH, _
 # … distance from the centre [m], metres on the plate per pixel square to the edge, and the unit
 # normal of the edge in the image, outwards; what comes of it
 _OUT, _PER_PX, _NORMAL_X, _NORMAL_Y, _FIRST, _SECOND, _THIRD, _FOURTH = _OTHERS
-_NOWHERE_M = 1e-9  # keeps directions finite in a circle's centre
+_LEAST_DISTANCE_M = 1e-9  # keeps directions finite in a circle's centre
 _SQUARINGS = 10
 _PART = 0.5**_SQUARINGS
 _LEAST_EXPONENT = -200.0  # keeps what is endlessly far from an edge at zero
@@ -204,7 +204,7 @@ def _gather_edges(views: FloatArray, circle: FloatArray, pixels: IndexArray, w: 
         w[_Y_RIGHT + j], w[_Y_DOWN + j] = views[4, i], views[5, i]
     for j in range(_BATCH):
         x, y = w[_X + j], w[_Y + j]
-        out_m = max(math.sqrt(x * x + y * y), _NOWHERE_M)
+        out_m = max(math.sqrt(x * x + y * y), _LEAST_DISTANCE_M)
         right = (x * w[_X_RIGHT + j] + y * w[_Y_RIGHT + j]) / out_m
         down = (x * w[_X_DOWN + j] + y * w[_Y_DOWN + j]) / out_m
         per_px = math.sqrt(right * right + down * down)
