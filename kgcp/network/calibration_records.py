@@ -83,6 +83,15 @@ class CameraCalibration:
         return rms_px(self.solution)
 
     @property
+    def bar_residuals_m(self) -> tuple[float, ...]:
+        """Measured minus adjusted length of each of the field's bars [m]."""
+        place_of = dict(zip(self.field.names(), self.solution.estimate.points, strict=True))
+        return tuple(
+            bar.length_m - float(np.linalg.norm(place_of[bar.second] - place_of[bar.first]))
+            for bar in self.field.bars
+        )
+
+    @property
     def operator_sd_px(self) -> float:
         """Median of the discs' own deviations per point, as the operator states them [px]."""
         return operator_sd_px(self.views)

@@ -35,6 +35,7 @@ from kgcp.network.equations import (
     bordered_by,
     inner_constraints,
     prior_cost,
+    prior_equations,
     reduce_poses,
     scales_of,
     view_rows,
@@ -136,13 +137,7 @@ def _determined_by_priors(network: Network, solution: Solution) -> float:
         return determined_by_priors(network, reduce_points(network, solution.estimate, equations))
     system = reduce_poses(network, solution.estimate, equations)
     inverse = _inverse(network, system)
-    information = np.zeros_like(inverse)
-    cameras = np.arange(network.cameras.values.size)
-    information[cameras, cameras] = network.cameras.sd.ravel() ** -2.0
-    if network.points.information is not None:
-        index = np.arange(len(network.points.nominal))
-        blocks = information[len(cameras) :, len(cameras) :].reshape(len(index), 3, len(index), 3)
-        blocks[index, :, index, :] = network.points.information
+    information, _ = prior_equations(network, solution.estimate, len(inverse))
     by_bends = 0.0
     if network.bends is not None:
         cofactors = _bend_cofactors(system, inverse)
@@ -156,6 +151,8 @@ def _degrees_of_freedom(network: Network, weights: FloatArray, unknowns: int) ->
     priors = int(np.count_nonzero(np.isfinite(network.cameras.sd))) + len(network.points.bars)
     if network.points.information is not None:
         priors += int(np.linalg.matrix_rank(network.points.information).sum())
+    if network.points.scale_row is not None:
+        priors -= 1
     poses = 6 * len(network.view_camera)
     return used + priors + network.points.datum_defect - unknowns - poses
 

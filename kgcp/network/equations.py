@@ -191,7 +191,7 @@ def reduce_poses(
     size = network.cameras.values.size
     if not network.points.is_fixed:
         size += estimate.points.size
-    normal, right = _priors(network, estimate, size)
+    normal, right = prior_equations(network, estimate, size)
     diagonal = normal.diagonal().copy()
     pose_normals, pose_rights, couplings = [], [], []
     for view in equations:
@@ -244,7 +244,9 @@ def _unreduced(view: ViewRows) -> tuple[FloatArray, FloatArray, FloatArray]:
     return direct, coupling, right
 
 
-def _priors(network: Network, estimate: Estimate, size: int) -> tuple[FloatArray, FloatArray]:
+def prior_equations(
+    network: Network, estimate: Estimate, size: int
+) -> tuple[FloatArray, FloatArray]:
     """Return what is known of cameras and points beforehand, as normal equations."""
     normal, right = np.zeros((size, size)), np.zeros(size)
     information = network.cameras.sd.ravel() ** -2.0
@@ -260,6 +262,10 @@ def _priors(network: Network, estimate: Estimate, size: int) -> tuple[FloatArray
     blocks[index, :, index, :] = prior.information
     gaps = prior.nominal - estimate.points
     right[first:] = np.einsum("nij,nj->ni", prior.information, gaps).ravel()
+    row = prior.scale_row
+    if row is not None:
+        normal[first:, first:] -= np.outer(row, row)
+        right[first:] -= row * float(row @ gaps.ravel())
     for bar in prior.bars:
         columns, slope, gap = _bar_row(bar, estimate.points, first)
         normal[np.ix_(columns, columns)] += np.outer(slope, slope)
@@ -284,6 +290,8 @@ def prior_cost(network: Network, estimate: Estimate) -> float:
     if prior.information is not None:
         gaps = estimate.points - prior.nominal
         cost += float(np.einsum("ni,nij,nj->", gaps, prior.information, gaps))
+        if prior.scale_row is not None:
+            cost -= float(prior.scale_row @ gaps.ravel()) ** 2
         cost += sum(_bar_row(bar, estimate.points, 0)[2] ** 2 for bar in prior.bars)
     if network.bends is not None:
         cost += float(np.sum((estimate.bends / network.bends.sd) ** 2))

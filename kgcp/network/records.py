@@ -46,7 +46,10 @@ class ScaleBar:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointPrior:
-    """Where the points of a field are supposed to be, and how firmly."""
+    """Where the points of a field are supposed to be, and how firmly.
+
+    Bars alone determine the scale: `nominal` then says no more than the field's shape.
+    """
 
     nominal: FloatArray  # (m, 3)
     # (m, 3, 3): inverse covariances of the deviations from `nominal`; zeros: free; None: the points
@@ -65,6 +68,20 @@ class PointPrior:
         if self.information is None or np.any(self.information):
             return 0
         return 6 if self.bars else 7
+
+    @property
+    def scale_row(self) -> FloatArray | None:
+        """The row (3m,) by which an unknown scale of `nominal` reduces the information.
+
+        What is known of the points without their scale has the information P - r rᵀ, where
+        r = P d / √(dᵀ P d) and d is the change of the points by the scale. None: nothing is
+        reduced.
+        """
+        if self.information is None or not self.bars or not np.any(self.information):
+            return None
+        grown = self.nominal - self.nominal.mean(axis=0)
+        pull = np.einsum("nij,nj->ni", self.information, grown)
+        return np.asarray(pull.ravel() / np.sqrt(np.sum(pull * grown)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

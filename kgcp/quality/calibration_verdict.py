@@ -27,6 +27,7 @@ _MOST_REJECTED = 0.1
 _FOCAL_SHARE = 0.01
 _OPERATOR_RATIO = 3.0
 _FIELD_RATIO = 2.0
+_BAR_SDS = 3.0  # of a bar, by which the field may miss it
 _COVERAGE = 0.7
 _NORMALS_DEG = 15.0
 _RADIUS_SHARE = 0.03
@@ -273,6 +274,7 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
             f"discs fit {ratio:.1f} times worse ({numbers.rms_px:.3f} px) than they are measured"
         )
     yield from _field_doubts(numbers)
+    yield from _bar_doubts(calibration)
     if numbers.coverage < _COVERAGE:
         yield f"discs cover {100.0 * numbers.coverage:.0f} % of the frame"
     if numbers.normals_deg < _NORMALS_DEG:
@@ -314,6 +316,20 @@ def _field_doubts(numbers: CalibrationNumbers) -> Iterator[str]:
             "the field bends from photograph to photograph, by"
             f" {1000.0 * bending.height_m:.2g} mm ({bending.image_px:.2f} px)"
         )
+
+
+def _bar_doubts(calibration: CameraCalibration) -> Iterator[str]:
+    bars = calibration.field.bars
+    if bars and calibration.points_used is PointModel.FIXED:
+        yield "the field is taken as stated, so that its bars are not used"
+        return
+    for bar, residual_m in zip(bars, calibration.bar_residuals_m, strict=True):
+        if abs(residual_m) > _BAR_SDS * bar.sd_m:
+            yield (
+                f"the bar from {bar.first} to {bar.second} is {1000.0 * abs(residual_m):.2g} mm"
+                f" {'longer' if residual_m > 0.0 else 'shorter'} than the photographs and the other"
+                f" bars say, {abs(residual_m) / bar.sd_m:.0f} times its standard deviation"
+            )
 
 
 def _fits_badly(numbers: CalibrationNumbers) -> bool:

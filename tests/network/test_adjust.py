@@ -120,6 +120,28 @@ def test_a_bar_gives_a_free_field_its_scale(rng: np.random.Generator) -> None:
     assert size == pytest.approx(bar.length, rel=1e-5)
 
 
+def test_a_bar_gives_a_stiff_field_its_scale_and_the_nominal_one_does_not(
+    rng: np.random.Generator,
+) -> None:
+    """The ends of the bar are off, too: a nominal scale would pull it away from its length."""
+    nominal = simulated().network.points.nominal
+    printed = 1.02 * (nominal + 0.00005 * rng.standard_normal(nominal.shape))
+    length = float(np.linalg.norm(printed[34] - printed[0]))
+    bar = ScaleBar(0, 34, length, 0.00005)
+    information = np.broadcast_to(np.eye(3) / 0.00005**2, (35, 3, 3))
+    prior = PointPrior(nominal, information, (bar,))
+    made = simulated(points=prior, displaced_m=printed - nominal).observed(rng)
+    solution = adjust_network(made.network, made.start(rng))
+    points = solution.estimate.points
+    assert np.linalg.norm(points[34] - points[0]) == pytest.approx(length, abs=0.1 * bar.sd)
+    known = precision(made.network, solution)
+    assert known.variance_factor == pytest.approx(1.0, abs=0.25)
+    across = np.zeros(len(known.inverse))
+    along = (points[34] - points[0]) / length
+    across[5:8], across[-3:] = -along, along
+    assert np.sqrt(across @ known.inverse @ across) == pytest.approx(bar.sd, rel=0.01)
+
+
 def test_a_stiff_field_bends_no_further_than_its_prior_allows(rng: np.random.Generator) -> None:
     bend = 0.0002 * rng.standard_normal((35, 3))
     nominal = simulated().network.points.nominal

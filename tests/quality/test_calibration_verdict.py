@@ -218,6 +218,38 @@ def test_a_larger_field_is_told_if_a_distance_was_measured() -> None:
     assert "in its plane" in field.doubt
 
 
+def barred(*lengths: float, points: PointModel = PointModel.STIFF) -> CameraCalibration:
+    """Return a calibration of the field with bars along its first row and its first column."""
+    ends = (("r0c0", "r0c5", 0.2), ("r0c0", "r4c0", 0.16))
+    bars = tuple(
+        FieldBar(first, last, share * length_m, 0.00002)
+        for share, (first, last, length_m) in zip(lengths, ends, strict=False)
+    )
+    settings = CalibrationSettings(points, LensModel.AUTO)
+    return calibrate_camera(views(), replace(FIELD, bars=bars), (1600, 1200), settings)
+
+
+def test_a_stiff_field_has_the_length_that_was_measured() -> None:
+    result = barred(1.0005)
+    (residual_m,) = result.bar_residuals_m
+    assert abs(residual_m) < 0.00002
+    assert judge(result, calibration_numbers(result)).grade is CalibrationGrade.GOOD
+
+
+def test_bars_that_contradict_each_other_are_named() -> None:
+    result = barred(1.005, 0.995)
+    verdict = judge(result, calibration_numbers(result))
+    assert verdict.grade is CalibrationGrade.LOOK
+    assert re.search(r"the bar from r0c0 to r0c5 is \d\.\d+ mm longer than", verdict.sentence)
+    assert re.search(r"the bar from r0c0 to r4c0 is \d\.\d+ mm shorter than", verdict.sentence)
+
+
+def test_bars_of_a_field_that_is_fixed_are_told_not_to_be_used() -> None:
+    result = barred(1.005, points=PointModel.FIXED)
+    verdict = judge(result, calibration_numbers(result))
+    assert "the field is taken as stated, so that its bars are not used" in verdict.sentence
+
+
 def _about_middle() -> FloatArray:
     flat = FIELD.points_m()[:, :2]
     return np.asarray(flat - flat.mean(axis=0))

@@ -191,6 +191,12 @@ def _summary(
         "largest_angle_deg": numbers.normals_deg,
         "radius_scale": calibration.radius_scale,
         "flatness_m": numbers.flatness_m,
+        "bars": [
+            {"from": bar.first, "to": bar.second, "sd_m": bar.sd_m, "residual_m": residual_m}
+            for bar, residual_m in zip(
+                calibration.field.bars, calibration.bar_residuals_m, strict=True
+            )
+        ],
         "bending_m": None if numbers.bending is None else numbers.bending.height_m,
         "bending_px": None if numbers.bending is None else numbers.bending.image_px,
         "change_if_eccentricity_neglected": change_if_neglected(calibration),
