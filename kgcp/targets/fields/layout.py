@@ -21,6 +21,7 @@ LEAST_POINTS, MOST_POINTS = 6, 5000
 
 _LARGEST_DISC_M = 3.0  # diameter: 3 mm and more, typed for metres, are told
 _MOST_OFF_BAR = 0.05  # of the stated distance of its discs
+_MOST_APART_SDS = 5.0  # of two bars between the same discs, of their difference's deviation
 
 
 class GridKind(StrEnum):
@@ -310,6 +311,22 @@ def check_bars(bars: tuple[FieldBar, ...], names: tuple[str, ...], points_m: Flo
                 "length_m",
                 f"{bar.length_m:g} m, but {bar.first} and {bar.second} are {stated_m:g} m apart",
                 "correct the bar, or the field",
+            )
+    _check_repeated_bars(bars)
+
+
+def _check_repeated_bars(bars: tuple[FieldBar, ...]) -> None:
+    """Raise `SettingError` for two bars of one pair whose lengths contradict each other."""
+    first_of: dict[frozenset[str], FieldBar] = {}
+    for bar in bars:
+        first = first_of.setdefault(frozenset((bar.first, bar.second)), bar)
+        most_m = _MOST_APART_SDS * math.hypot(bar.sd_m, first.sd_m)
+        if abs(bar.length_m - first.length_m) > most_m:
+            raise SettingError(
+                "length_m",
+                f"{first.length_m:g} m and {bar.length_m:g} m, both between {bar.first} and"
+                f" {bar.second}, contradict each other",
+                "correct one of them, or their sd_m",
             )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from kgcp.errors import SettingError
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import rotation_about
-from kgcp.targets.fields.layout import Field, GridKind, Mark
+from kgcp.targets.fields.layout import Field, FieldBar, GridKind, Mark
 from kgcp.targets.fields.naming import Naming, NamingProblem, SeenDiscs, name_discs
 
 CAMERA = Camera(1600, 1200, 1300.0, 1300.0, 790.0, 610.0, -0.15, 0.05)
@@ -186,6 +188,15 @@ def test_lattices_count_as_their_programs_do() -> None:
     assert SQUARE.symmetries() == []
 
 
+def bar(first: str, second: str, length_m: float) -> FieldBar:
+    return FieldBar(first, second, length_m, 0.0001)
+
+
+def test_a_distance_may_be_measured_twice() -> None:
+    bars = (bar("r0c0", "r0c8", 0.2003), bar("r0c8", "r0c0", 0.1999))
+    assert len(replace(SQUARE, columns=9, pitch_m=0.025, bars=bars).bars) == 2
+
+
 @pytest.mark.parametrize(
     ("change", "key"),
     [
@@ -196,6 +207,7 @@ def test_lattices_count_as_their_programs_do() -> None:
         ({"marks": (Mark(1, 0, 0.01), Mark(1, 0, 0.01))}, "at"),
         ({"marks": (Mark(1, 0, 0.01, 0.01),)}, "inner_diameter_m"),
         ({"flat_sd_m": (0.0, 1e-4, 1e-4)}, "flat_sd_m"),
+        ({"bars": (bar("r0c0", "r0c8", 0.202), bar("r0c8", "r0c0", 0.198))}, "length_m"),
     ],
 )
 def test_what_cannot_be_a_field_is_refused(change: dict[str, object], key: str) -> None:
