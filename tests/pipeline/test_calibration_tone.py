@@ -6,16 +6,21 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, cast
 
 import pytest
 
 from kgcp.errors import KgcpWarning
 from kgcp.measurement.discs.camera_tone import CameraTone
-from kgcp.measurement.discs.photograph import PhotoTask
+from kgcp.measurement.discs.fit_disc import ProcessingPrior
+from kgcp.measurement.discs.photograph import PhotoDiscs, PhotoMiss, PhotoTask
 from kgcp.measurement.image_model.photometry import Tone
-from kgcp.pipeline.calibration.run import _camera_of
+from kgcp.pipeline.calibration.photographs import Photo
+from kgcp.pipeline.calibration.run import _camera_of, _Looks
+from kgcp.pipeline.detect import NoProgress
 from kgcp.pipeline.execution.executor import WorkerPool
+from kgcp.pipeline.execution.journal import Journal
 from kgcp.pipeline.execution.resilient_map import SerialExecutor, TaskFailure
 
 
@@ -28,6 +33,16 @@ class LosingPool(WorkerPool):
         assert callable(function)
         for item in items:
             yield item, TaskFailure.CRASHED
+
+
+class MeasuringPool(WorkerPool):
+    """Works at once, in this process."""
+
+    def map(
+        self, function: Callable[..., Any], items: Iterable[Any]
+    ) -> Generator[tuple[Any, Any | TaskFailure]]:
+        for item in items:
+            yield item, function(item)
 
 
 UNRELIABLE = CameraTone(Tone.UNKNOWN, 1.0, is_reliable=False)
@@ -60,3 +75,19 @@ def test_a_tone_that_cannot_be_learned_together_is_reliable() -> None:
     pool = LosingPool(1, SerialExecutor(), (), Counter())
     with pytest.warns(KgcpWarning, match="has ended or taken too long"):
         assert _camera_of(pool, cast("PhotoTask", None), ()) is None
+
+
+def test_what_was_measured_with_another_tone_is_measured_anew(tmp_path: Path) -> None:
+    """Of other photographs, another tone is learned."""
+    photo = Photo("a.png", tmp_path / "a.png")
+    photo.path.write_bytes(b"nothing")
+    pool, kinds = MeasuringPool(1, SerialExecutor(), (), Counter()), (PhotoDiscs, PhotoMiss)
+    tones = (None, replace(UNRELIABLE, known=ProcessingPrior.usual()), UNRELIABLE, UNRELIABLE)
+    results = []
+    with Journal(tmp_path / "journal", {"by": "test"}, kinds, is_new=False) as journal:
+        for index, tone in enumerate(tones):
+            result = PhotoMiss(photo.name, 0, 0, "too_few", f"look {index}")
+            looks = _Looks(journal, pool, NoProgress(), tone)
+            results += looks.through("photographs", [photo], [photo.name], lambda _, r=result: r)
+    details = [result.detail for result in results if isinstance(result, PhotoMiss)]
+    assert details == ["look 0", "look 1", "look 2", "look 2"]

@@ -172,8 +172,8 @@ def calibrate_photos(
         Journal(path, making, kinds, is_new=is_new) as journal,
         open_pool(options.jobs, options.photo_timeout_s, None, out) as pool,
     ):
-        looks = _Looks(journal, pool, listener)
         task = replace(task, camera=_camera_of(pool, task, photos))
+        looks = _Looks(journal, pool, listener, task.camera)
         first = looks.through(
             "photographs", photos, [photo.name for photo in photos], partial(measure_photo, task)
         )
@@ -219,15 +219,21 @@ def _camera_of(pool: WorkerPool, task: PhotoTask, photos: Sequence[Photo]) -> Ca
 
 
 class _Looks:
-    """Work on photographs by a pool, with results that a journal keeps."""
+    """Work on photographs by a pool, with results that a journal keeps.
+
+    What was measured with another tone is measured anew: photographs may have been added or taken
+    away since.
+    """
 
     def __init__(
         self,
         journal: Journal[PhotoDiscs | PhotoMiss],
         pool: WorkerPool,
         listener: ProgressListener,
+        tone: CameraTone | None,
     ) -> None:
         self._journal, self._pool, self._listener = journal, pool, listener
+        self._tone = tone
 
     def through(
         self,
@@ -237,7 +243,7 @@ class _Looks:
         function: Callable[[_Item], PhotoDiscs | PhotoMiss],
     ) -> list[PhotoDiscs | PhotoMiss]:
         """Return the results of all items, in their order."""
-        keys = [fingerprint(stage, _stamp(item), item) for item in items]
+        keys = [fingerprint(stage, self._tone, _stamp(item), item) for item in items]
         row_of = {id(item): row for row, item in enumerate(items)}
         results: dict[int, PhotoDiscs | PhotoMiss] = {}
         for row, key in enumerate(keys):
