@@ -9,12 +9,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
+import cv2
+import numpy as np
 import pytest
 
 from kgcp.errors import KgcpWarning
+from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.camera import Response
 from kgcp.measurement.discs.camera_tone import CameraTone
 from kgcp.measurement.discs.fit_disc import ProcessingPrior
 from kgcp.measurement.discs.photograph import PhotoDiscs, PhotoMiss, PhotoTask
+from kgcp.measurement.discs.records import Operator
 from kgcp.measurement.image_model.photometry import Tone
 from kgcp.pipeline.calibration.photographs import Photo
 from kgcp.pipeline.calibration.run import _camera_of, _Looks
@@ -22,6 +27,7 @@ from kgcp.pipeline.detect import NoProgress
 from kgcp.pipeline.execution.executor import WorkerPool
 from kgcp.pipeline.execution.journal import Journal
 from kgcp.pipeline.execution.resilient_map import SerialExecutor, TaskFailure
+from kgcp.targets.fields.layout import Field, GridKind
 
 
 class LosingPool(WorkerPool):
@@ -91,3 +97,26 @@ def test_what_was_measured_with_another_tone_is_measured_anew(tmp_path: Path) ->
             results += looks.through("photographs", [photo], [photo.name], lambda _, r=result: r)
     details = [result.detail for result in results if isinstance(result, PhotoMiss)]
     assert details == ["look 0", "look 1", "look 2", "look 2"]
+
+
+def test_the_tone_is_learned_from_five_photographs_that_can_be_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos = [Photo(f"{index}.png", tmp_path / f"{index}.png") for index in range(12)]
+    for index, photo in enumerate(photos):
+        grey = np.full((2, 2 + index), 128, dtype=np.uint8)
+        if index in {0, 4}:
+            photo.path.write_bytes(b"nothing")
+        else:
+            cv2.imwrite(str(photo.path), grey)
+    widths: list[int] = []
+
+    def learn(greys: Iterable[GreyArray], task: PhotoTask) -> None:
+        assert task.camera is None
+        widths.extend(grey.shape[1] - 2 for grey in greys)
+
+    monkeypatch.setattr("kgcp.pipeline.calibration.photographs.learn_from_fields", learn)
+    field = Field("f", GridKind.SQUARE, 5, 4, 0.03, 0.016)
+    task = PhotoTask(field, Response.UNKNOWN, Operator.MODEL)
+    _camera_of(MeasuringPool(1, SerialExecutor(), (), Counter()), task, photos)
+    assert widths == [2, 6, 8, 10, 1]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -46,13 +48,15 @@ class SecondLook:
 
 
 @single_threaded()
-def learn_from_photos(task: PhotoTask, photos: tuple[Photo, ...]) -> CameraTone | None:
-    """Learn what a camera does to all discs from some photographs, as far as they can be read."""
-    greys = []
+def learn_from_photos(task: PhotoTask, count: int, photos: tuple[Photo, ...]) -> CameraTone | None:
+    """Learn what a camera does to all discs from the first photographs that can be read."""
+    return learn_from_fields(islice(_readable(photos), count), task)
+
+
+def _readable(photos: Iterable[Photo]) -> Iterator[GreyArray]:
     for photo in photos:
         with suppress(Rejection):
-            greys.append(_read(photo.path))
-    return learn_from_fields(greys, task)
+            yield _read(photo.path)
 
 
 @single_threaded()

@@ -195,8 +195,10 @@ def calibrate_photos(
 
 def _camera_of(pool: WorkerPool, task: PhotoTask, photos: Sequence[Photo]) -> CameraTone | None:
     """Learn from some photographs what the camera does to all discs; None: each for itself."""
-    some = tuple(photos[:: max(len(photos) // LEARNED_FROM, 1)][:LEARNED_FROM])
-    with closing(pool.map(partial(learn_from_photos, task), [some])) as outcomes:
+    step = max(len(photos) // LEARNED_FROM, 1)
+    # from the whole set; where one cannot be read, the next one takes its place
+    ordered = tuple(photo for first in range(step) for photo in photos[first::step])
+    with closing(pool.map(partial(learn_from_photos, task, LEARNED_FROM), [ordered])) as outcomes:
         ((_, learned),) = outcomes
     if isinstance(learned, TaskFailure):
         warnings.warn(
