@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -34,6 +34,7 @@ _RADIUS_SHARE = 0.03
 # Of the radii, from those of most photographs. Discs of R 4 px, sharpened and in motion, are off by
 # up to 5.5 % (ros10).
 _OTHER_FIELD_SHARE = 0.1
+_NAMED = 3  # photographs or discs; of more, the number is said
 _WIDE_DEG = 100.0  # of the field of view, beyond which lenses are fisheyes
 
 
@@ -275,6 +276,9 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
         )
     yield from _field_doubts(numbers)
     yield from _bar_doubts(calibration)
+    if never := discs_that_never_fit(calibration):
+        discs = "disc {} does" if len(never) == 1 else "discs {} do"
+        yield f"{discs.format(_listed(never))} not fit in any photograph"
     if numbers.coverage < _COVERAGE:
         yield f"discs cover {100.0 * numbers.coverage:.0f} % of the frame"
     if numbers.normals_deg < _NORMALS_DEG:
@@ -284,10 +288,9 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
         other = "larger" if off > 0.0 else "smaller"
         yield f"discs are {100.0 * abs(off):.0f} % {other} than stated"
     if others := _of_other_discs(calibration):
-        named = ", ".join(others[:3]) + (f" and {len(others) - 3} more" if others[3:] else "")
         yield (
-            f"by their distances, discs have another size in {named} than in most photographs: give"
-            " photographs of one field only"
+            f"by their distances, discs have another size in {_listed(others)} than in most"
+            " photographs: give photographs of one field only"
         )
     if calibration.is_turn_unclear:
         yield (
@@ -316,6 +319,21 @@ def _field_doubts(numbers: CalibrationNumbers) -> Iterator[str]:
             "the field bends from photograph to photograph, by"
             f" {1000.0 * bending.height_m:.2g} mm ({bending.image_px:.2f} px)"
         )
+
+
+def discs_that_never_fit(calibration: CameraCalibration) -> tuple[str, ...]:
+    """Return the discs that several photographs show, and that do not fit in any of them."""
+    point = calibration.network.observations.point
+    names = calibration.field.names()
+    shown = np.bincount(point, minlength=len(names))
+    used = np.bincount(point[calibration.solution.is_used], minlength=len(names))
+    return tuple(names[k] for k in np.flatnonzero((shown > 1) & (used == 0)).tolist())
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:_NAMED]) + (
+        f" and {len(names) - _NAMED} more" if names[_NAMED:] else ""
+    )
 
 
 def _bar_doubts(calibration: CameraCalibration) -> Iterator[str]:
@@ -389,6 +407,11 @@ def _field_advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -
         yield (
             "Measure the diameter and the pitch of the print; the camera does not depend on them."
             " Burnt white also displaces edges."
+        )
+    if discs_that_never_fit(calibration):
+        yield (
+            "Correct the places or codes of the discs that do not fit in any photograph, or take"
+            " them out of the field's description."
         )
     if calibration.is_turn_unclear:
         yield "Give the field a mark: one disc that is hollow, larger or missing."

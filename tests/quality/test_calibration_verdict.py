@@ -15,6 +15,8 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle_image import Circles3D, circle_images
 from kgcp.geometry.pose import rotation_about
+from kgcp.io.tables.calibration import FIELD_COLUMNS, field_csv, field_discs
+from kgcp.io.tables.columns import row_of
 from kgcp.network.calibration import calibrate_camera, missing_discs
 from kgcp.network.calibration_records import (
     CalibrationSettings,
@@ -463,6 +465,25 @@ def test_a_displaced_disc_is_rejected_everywhere() -> None:
     rejected = result.network.observations.point[~result.solution.is_used]
     assert rejected.tolist() == [7] * 6
     assert result.camera.fx == pytest.approx(1500.0, abs=0.5)
+
+
+def test_discs_that_fit_in_no_photograph_are_named_and_not_placed() -> None:
+    made = []
+    for view in views():
+        vectors = view.vectors.copy()
+        vectors[[13, 14], 0] += 30.0, -30.0
+        made.append(replace(view, vectors=vectors))
+    result = calibrated(made, PointModel.STIFF, LensModel.AUTO)
+    verdict = judge(result, calibration_numbers(result))
+    assert verdict.reasons == ("discs r2c1, r2c2 do not fit in any photograph",)
+    assert any("Correct the places or codes" in sentence for sentence in verdict.advice)
+    discs = field_discs(result)
+    assert [disc.name for disc in discs if disc.adjusted is None] == ["r2c1", "r2c2"]
+    text = field_csv(discs)
+    assert "r2c0," in text
+    assert "r2c1," not in text
+    row = row_of(FIELD_COLUMNS, discs[13])
+    assert (row["rays"], row["x_m"], row["sd_x_m"], row["change_x_m"]) == (0, None, None, None)
 
 
 def test_more_than_a_tenth_of_wrong_discs_make_it_unusable() -> None:

@@ -51,8 +51,8 @@ class FieldDisc:
 
     name: str
     nominal: FloatArray  # (3,)
-    adjusted: FloatArray  # (3,)
-    cov: FloatArray | None  # (3, 3); None: the points were fixed
+    adjusted: FloatArray | None  # (3,); None: no photograph tells where it is
+    cov: FloatArray | None  # (3, 3); None: likewise, or the points were fixed
     rays: int
 
 
@@ -102,7 +102,8 @@ FIELD_COLUMNS: tuple[Column[FieldDisc], ...] = (
     *Column[FieldDisc].of_sds(("sd_x_m", "sd_y_m", "sd_z_m"), lambda disc: disc.cov),
     Column("cov", NUMBERS, lambda disc: matrix_cell(disc.cov)),
     *Column[FieldDisc].of_vector(
-        ("change_x_m", "change_y_m", "change_z_m"), lambda disc: disc.adjusted - disc.nominal
+        ("change_x_m", "change_y_m", "change_z_m"),
+        lambda disc: None if disc.adjusted is None else disc.adjusted - disc.nominal,
     ),
     Column("rays", INTEGER, lambda disc: disc.rays),
 )
@@ -160,19 +161,25 @@ def field_discs(calibration: CameraCalibration) -> list[FieldDisc]:
     first = calibration.network.cameras.values.size
     inverse = calibration.precision.inverse * calibration.precision.variance_factor
     discs = []
+    is_fixed = calibration.points_used is PointModel.FIXED
     for index, name in enumerate(calibration.field.names()):
-        cov = None
-        if calibration.points_used is not PointModel.FIXED:
+        adjusted, cov = points[index] if is_fixed or rays[index] else None, None
+        if not is_fixed and rays[index]:
             own = slice(first + 3 * index, first + 3 * index + 3)
             cov = inverse[own, own]
-        discs.append(FieldDisc(name, nominal[index], points[index], cov, rays[index]))
+        discs.append(FieldDisc(name, nominal[index], adjusted, cov, rays[index]))
     return discs
 
 
 def field_csv(discs: list[FieldDisc]) -> str:
-    """Return the field as text: name, x, y, z and their deviations [m]."""
+    """Return the field as text: name, x, y, z and their deviations [m].
+
+    Discs that no photograph tells of are left out: what was known beforehand is no result.
+    """
     rows = []
     for disc in discs:
+        if disc.adjusted is None:
+            continue
         sds = ["" if (sd := sd_cell(disc.cov, axis)) is None else f"{sd:.9f}" for axis in range(3)]
         rows.append([disc.name, *(f"{value:.9f}" for value in disc.adjusted), *sds])
     return csv_text(["name", "x", "y", "z", "sd_x", "sd_y", "sd_z"], rows)
