@@ -257,15 +257,7 @@ class CalibrationProblem:
         self, camera: Camera, estimate: Estimate, observed: Observations
     ) -> Eccentricity:
         """Return how far the centroids of all discs are from the images of their centres."""
-        return eccentricity(camera, self._circles(estimate, observed))
-
-    def _circles(self, estimate: Estimate, observed: Observations) -> Circles3D:
-        rotations = estimate.rotations[observed.view]
-        centres = np.einsum("nij,nj->ni", rotations, estimate.points[observed.point])
-        centres += estimate.translations[observed.view]
-        radii, normals = self.field.radii_m(), self.field.normals()
-        axes = np.einsum("nij,njk->nik", rotations, plane_axes(normals)[observed.point])
-        return Circles3D(centres, axes, radii[observed.point])
+        return eccentricity(camera, observed_circles(self.field, estimate, observed))
 
     def point_prior(self, points: PointModel) -> PointPrior:
         """Return what the adjustment knows of the field; unseen points stay where they are."""
@@ -321,12 +313,23 @@ class CalibrationProblem:
     def _radius_ratios(self, state: AdjustedNetwork) -> FloatArray:
         """Return measured over expected radii (n,); NaN of discs that are not used."""
         observed = self.observations()
-        expected = circle_images(state.camera, self._circles(state.estimate, observed)).moments
+        expected = circle_images(
+            state.camera, observed_circles(self.field, state.estimate, observed)
+        ).moments
         measured = np.concatenate([view.vectors for view in self.views])
         usable = np.all(np.isfinite(expected), axis=1) & state.solution.is_used
         ratios = np.full(len(measured), np.nan)
         ratios[usable] = (_determinant(measured[usable]) / _determinant(expected[usable])) ** 0.25
         return ratios
+
+
+def observed_circles(field: AnyField, estimate: Estimate, observed: Observations) -> Circles3D:
+    """Return the outlines of observed discs (n,) in the frames of their photographs' cameras."""
+    rotations = estimate.rotations[observed.view]
+    centres = np.einsum("nij,nj->ni", rotations, estimate.points[observed.point])
+    centres += estimate.translations[observed.view]
+    axes = np.einsum("nij,njk->nik", rotations, plane_axes(field.normals())[observed.point])
+    return Circles3D(centres, axes, field.radii_m()[observed.point])
 
 
 def _centre_of(names: Sequence[str]) -> IndexArray:

@@ -9,9 +9,9 @@ import numpy as np
 
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS
 from kgcp.geometry.camera import Camera
-from kgcp.geometry.circle_image import Circles3D
 from kgcp.io.tables.calibration import PhotoRow
 from kgcp.network.calibration_records import CameraCalibration
+from kgcp.network.camera_network import observed_circles
 from kgcp.quality.calibration_verdict import (
     CalibrationNumbers,
     CalibrationVerdict,
@@ -141,11 +141,7 @@ def _correlations(calibration: CameraCalibration) -> tuple[list[str], list[list[
 
 def _eccentricity(calibration: CameraCalibration) -> EccentricitySummary:
     """Return how large and tilted discs are, and how far their centroids are from their centres."""
-    estimate, observed = calibration.solution.estimate, calibration.network.observations
-    rotations = estimate.rotations[observed.view]
-    centres = np.einsum("nij,nj->ni", rotations, estimate.points[observed.point])
-    centres += estimate.translations[observed.view]
-    radii = calibration.field.radii_m()[observed.point]
-    return summarise_eccentricity(
-        calibration.camera, Circles3D(centres, rotations[:, :, :2], radii)
+    circles = observed_circles(
+        calibration.field, calibration.solution.estimate, calibration.network.observations
     )
+    return summarise_eccentricity(calibration.camera, circles)

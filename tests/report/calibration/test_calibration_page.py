@@ -1,0 +1,75 @@
+"""What the page says of a calibration by discs that face several ways, z towards the camera."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.circle_image import Circles3D, circle_images, plane_axes
+from kgcp.geometry.pose import rotation_about
+from kgcp.network.calibration import calibrate_camera
+from kgcp.network.calibration_records import (
+    CalibrationSettings,
+    CameraCalibration,
+    LensModel,
+    NamedView,
+    PointModel,
+)
+from kgcp.report.calibration.page import _eccentricity
+from kgcp.targets.fields.points import FieldPoint, PointField
+
+CAMERA = Camera(1600, 1200, 1500.0, 1500.0, 811.0, 583.0, -0.11)
+SD_PX = 0.01
+LEFT, RIGHT = (-0.6, 0.0, 0.8), (0.6, 0.0, 0.8)  # normals of two planes that meet at x = 0
+TILTS = ((0.4, 0.0), (0.0, 0.4), (-0.4, 0.1), (0.1, -0.4), (0.3, 0.3), (-0.3, 0.2))
+
+
+def corner() -> PointField:
+    """Discs on two planes like an open book seen from inside, y up and z towards the camera."""
+    points = [
+        FieldPoint(
+            f"p{column}{row}",
+            (0.04 * column, 0.05 * row, -0.03 * abs(column)),
+            0.02,
+            normal=LEFT if column < 0 else RIGHT,
+        )
+        for column in (-3, -2, -1, 1, 2, 3)
+        for row in (-2, -1, 0, 1, 2)
+    ]
+    return PointField("corner", tuple(points))
+
+
+@pytest.fixture(scope="module")
+def calibration() -> CameraCalibration:
+    """Six photographs of the corner, with exact moments and noise."""
+    rng, field, views = np.random.default_rng(18), corner(), []
+    points, upright = field.points_m(), np.diag([1.0, -1.0, -1.0])
+    for index, tilt in enumerate(TILTS):
+        turn = rotation_about(np.array([0.0, 0.0, 0.5 * np.pi * (index % 2)]))
+        rotation = rotation_about(np.array([*tilt, 0.0])) @ turn @ upright
+        centres = points @ rotation.T + [0.0, 0.0, 0.36]
+        circles = Circles3D(centres, rotation @ plane_axes(field.normals()), field.radii_m())
+        vectors = circle_images(CAMERA, circles).moments
+        vectors[:, :2] += SD_PX * rng.standard_normal((len(points), 2))
+        cov = np.diag([SD_PX**2, SD_PX**2, 1.0, 1.0, 1.0])
+        covs = np.broadcast_to(cov, (len(points), 5, 5))
+        views.append(
+            NamedView(f"p{index}", np.arange(len(points)), vectors, covs, is_symmetric=False)
+        )
+    settings = CalibrationSettings(PointModel.STIFF, LensModel.RADIAL)
+    return calibrate_camera(views, field, (CAMERA.width, CAMERA.height), settings)
+
+
+def test_eccentricities_are_those_of_discs_with_normals_of_their_own(
+    calibration: CameraCalibration,
+) -> None:
+    estimate = calibration.solution.estimate
+    normals = np.einsum("vij,mj->vmi", estimate.rotations, calibration.field.normals())
+    rays = np.einsum("vij,mj->vmi", estimate.rotations, estimate.points)
+    rays += estimate.translations[:, None]
+    cosines = np.abs(np.sum(normals * rays, axis=2)) / np.linalg.norm(rays, axis=2)
+    summary = _eccentricity(calibration)
+    assert summary.tilt_deg.median == pytest.approx(np.degrees(np.median(np.arccos(cosines))), 1e-3)
+    perspective_px = np.linalg.norm(calibration.eccentricity.perspective_px, axis=1)
+    assert summary.perspective_px.median == pytest.approx(np.median(perspective_px), rel=0.02)
