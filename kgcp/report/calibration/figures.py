@@ -11,6 +11,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, image_by_calibration
 from kgcp.geometry.camera import Camera
 from kgcp.network.calibration_records import CameraCalibration, PointModel
+from kgcp.network.records import Estimate
 from kgcp.quality.calibration_verdict import CalibrationNumbers
 from kgcp.quality.eccentricity import displacement_over_frame, eccentricity_over_angle
 from kgcp.quality.frame_rays import CameraDifference
@@ -141,6 +142,7 @@ def _field(calibration: CameraCalibration) -> Picture:
     """Draw how the field differs from what it is meant to be, in its plane and in height."""
     nominal = calibration.field.points_m()
     change = _MM * (calibration.solution.estimate.points - nominal)
+    side = side_of_cameras(calibration.solution.estimate)
     reach = float(np.ptp(nominal[:, 0]))
     largest = float(np.linalg.norm(change[:, :2], axis=1).max())
     scale = max(largest, 1e-9) / (2.0 * _ARROW_SHARE * _MM * reach)
@@ -149,15 +151,30 @@ def _field(calibration: CameraCalibration) -> Picture:
         axes = figure.subplots()
         x, y = (_MM * nominal[:, :2]).T
         heights = axes.scatter(
-            x, y, c=-change[:, 2], cmap="PuOr", vmin=-bound, vmax=bound, s=60.0, edgecolor=GREY
+            x,
+            y,
+            c=side * change[:, 2],
+            cmap="PuOr",
+            vmin=-bound,
+            vmax=bound,
+            s=60.0,
+            edgecolor=GREY,
         )
         _arrows(axes, _MM * nominal[:, :2], change[:, :2], scale, "black")
-        axes.invert_yaxis()
+        if side < 0.0:  # y down, as the cameras see it
+            axes.invert_yaxis()
         axes.set_aspect("equal")
         figure.colorbar(heights, cax=_beside(axes), label="towards the camera [mm]")
         axes.set_xlabel(f"x [mm]   (the longest arrow is {largest:.3f} mm)")
         axes.set_ylabel("y [mm]")
         return picture(figure)
+
+
+def side_of_cameras(estimate: Estimate) -> float:
+    """Return whether most cameras look from the field's +z (1.0) or, as at lattices, -z (-1.0)."""
+    centres = -np.einsum("vji,vj->vi", estimate.rotations, estimate.translations)
+    heights = centres[:, 2] - estimate.points[:, 2].mean()
+    return 1.0 if float(np.median(heights)) > 0.0 else -1.0
 
 
 def draw_eccentricity(camera: Camera, radii_px: Sequence[float]) -> Picture:

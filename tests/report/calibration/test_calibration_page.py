@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from kgcp.network.calibration_records import (
     NamedView,
     PointModel,
 )
+from kgcp.report.calibration.figures import side_of_cameras
 from kgcp.report.calibration.page import _eccentricity
 from kgcp.targets.fields.points import FieldPoint, PointField
 
@@ -73,3 +76,15 @@ def test_eccentricities_are_those_of_discs_with_normals_of_their_own(
     assert summary.tilt_deg.median == pytest.approx(np.degrees(np.median(np.arccos(cosines))), 1e-3)
     perspective_px = np.linalg.norm(calibration.eccentricity.perspective_px, axis=1)
     assert summary.perspective_px.median == pytest.approx(np.median(perspective_px), rel=0.02)
+
+
+def test_heights_are_drawn_towards_the_camera_on_either_side(
+    calibration: CameraCalibration,
+) -> None:
+    estimate = calibration.solution.estimate
+    assert side_of_cameras(estimate) == 1.0
+    mirrored = np.diag([1.0, -1.0, -1.0])  # half a turn about x, which lattices are seen in
+    turned = replace(
+        estimate, rotations=estimate.rotations @ mirrored, points=estimate.points @ mirrored
+    )
+    assert side_of_cameras(turned) == -1.0
