@@ -10,7 +10,7 @@ import numpy as np
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS
 from kgcp.geometry.camera import Camera
 from kgcp.io.tables.calibration import PhotoRow
-from kgcp.network.calibration_records import CameraCalibration
+from kgcp.network.calibration_records import CameraCalibration, PointModel
 from kgcp.network.camera_network import observed_circles
 from kgcp.quality.calibration_verdict import (
     CalibrationNumbers,
@@ -76,6 +76,8 @@ def render_calibration(page: CalibrationPage) -> str:
         verdict_class=page.verdict.grade.name.lower(),
         parameters=parameter_rows(page.calibration),
         correlations=_correlations(page.calibration),
+        fit=fit_words(page.calibration),
+        datum=datum_words(page.calibration),
         eccentricity=_eccentricity(page.calibration),
         neglected=neglected_words(page.calibration),
         ray_sd_px=float(np.sqrt(np.nanmean(page.numbers.ray_sd_px**2))),
@@ -108,6 +110,30 @@ def parameter_rows(calibration: CameraCalibration) -> list[ParameterRow]:
             )
         )
     return rows
+
+
+def fit_words(calibration: CameraCalibration) -> str:
+    """Return how well discs fit and whether all parameters are known, in words."""
+    weak = (
+        (calibration.undetermined, "not determined by these photographs"),
+        (calibration.tangled, "not told apart"),
+    )
+    remarks = [f"{', '.join(names)} {said}" for names, said in weak if names]
+    known = "; ".join(remarks) or "all parameters are determined"
+    return (
+        f"Discs fit to {calibration.rms_px:.3f} px and are measured to"
+        f" {calibration.operator_sd_px:.3f} px; {known}."
+    )
+
+
+def datum_words(calibration: CameraCalibration) -> str:
+    """Return what gives the field its place and scale, in words."""
+    has_bars = bool(calibration.field.bars)
+    sentences = ["The scale is that of the bars."] if has_bars else []
+    if calibration.points_used is PointModel.FREE:
+        datum = "Shift and turn" if has_bars else "Shift, turn and scale"
+        sentences.append(f"{datum} are those of the nominal field.")
+    return " ".join(sentences)
 
 
 def neglected_words(calibration: CameraCalibration) -> str:

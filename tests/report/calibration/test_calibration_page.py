@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +20,8 @@ from kgcp.network.calibration_records import (
     PointModel,
 )
 from kgcp.report.calibration.figures import side_of_cameras
-from kgcp.report.calibration.page import _eccentricity
+from kgcp.report.calibration.page import _eccentricity, datum_words, fit_words
+from kgcp.targets.fields.layout import FieldBar
 from kgcp.targets.fields.points import FieldPoint, PointField
 
 CAMERA = Camera(1600, 1200, 1500.0, 1500.0, 811.0, 583.0, -0.11)
@@ -88,3 +90,35 @@ def test_heights_are_drawn_towards_the_camera_on_either_side(
         estimate, rotations=estimate.rotations @ mirrored, points=estimate.points @ mirrored
     )
     assert side_of_cameras(turned) == -1.0
+
+
+def test_a_good_fit_is_told_with_what_it_does_not_determine(calibration: CameraCalibration) -> None:
+    told = fit_words(calibration)
+    assert re.fullmatch(
+        r"Discs fit to 0\.01\d px and are measured to 0\.014 px; all parameters are determined\.",
+        told,
+    )
+    weak = replace(calibration, undetermined=("k2",), tangled=("cx", "p1"))
+    said = "k2 not determined by these photographs; cx, p1 not told apart."
+    assert fit_words(weak).endswith(said)
+
+
+@pytest.mark.parametrize(
+    ("points", "has_bar", "told"),
+    [
+        (PointModel.STIFF, False, ""),
+        (PointModel.STIFF, True, "The scale is that of the bars."),
+        (PointModel.FREE, False, "Shift, turn and scale are those of the nominal field."),
+        (
+            PointModel.FREE,
+            True,
+            "The scale is that of the bars. Shift and turn are those of the nominal field.",
+        ),
+    ],
+)
+def test_what_gives_the_field_its_scale_is_told(
+    calibration: CameraCalibration, points: PointModel, *, has_bar: bool, told: str
+) -> None:
+    bars = (FieldBar("p-30", "p-31", 0.05, 0.00001),) if has_bar else ()
+    field = replace(calibration.field, bars=bars)
+    assert datum_words(replace(calibration, field=field, points_used=points)) == told
