@@ -206,7 +206,7 @@ def _draw_field(
 
     from kgcp.errors import KgcpError, KgcpWarning, SettingError
     from kgcp.io.files.atomic import write_bytes
-    from kgcp.io.flight.field_file import field_toml, read_field
+    from kgcp.io.flight.field_file import field_toml, keep_field_files, read_field
     from kgcp.io.print.write import write_sheets
     from kgcp.targets.fields.artwork import draw_field
     from kgcp.targets.fields.layout import Field
@@ -219,9 +219,11 @@ def _draw_field(
         raise KgcpError(f"{text}: {error}", option="field") from error
     sheets = lay_out(drawing, "the field", paper, is_tiled=is_tiled)
     folder = out or Path("targets")
+    description = folder / "field.toml"
+    keep_field_files(text, [description])
     files = write_sheets(sheets, "field", folder, formats, dpi)
-    files.append(folder / "field.toml")
-    write_bytes(files[-1], field_toml(field).encode())
+    write_bytes(description, field_toml(field).encode())
+    files.append(description)
     if as_json:
         told = {"field": field.name, "discs": len(field.names()), "sheets": len(sheets)}
         click.echo(json.dumps({**told, "files": [str(path) for path in files]}))

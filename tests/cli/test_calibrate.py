@@ -293,6 +293,23 @@ def test_what_cannot_be_is_said_before_anything_is_measured(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("name", ["field.toml", "field.csv"])
+def test_the_field_s_own_files_are_not_overwritten(photos: Path, tmp_path: Path, name: str) -> None:
+    described = tmp_path / "field.toml"
+    if name == "field.csv":
+        described = tmp_path / "panel.toml"
+        described.write_text('diameter_m = 0.016\n[points]\nfile = "field.csv"\n')
+        places = [(0.03 * (k % 5), 0.03 * (k // 5) + 0.001 * k) for k in range(20)]
+        rows = [f"p{k},{x},{y},0.0\n" for k, (x, y) in enumerate(places)]
+        (tmp_path / name).write_text("name,x,y,z\n" + "".join(rows))
+    else:
+        described.write_text(FIELD_TOML)
+    result = run(photos, "--field", described, "--out", tmp_path, *QUIET)
+    assert result.exit_code == 1
+    assert f"{name}: describes the field and would be overwritten; write to" in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
 def test_a_board_without_a_unit_asks_for_it(photos: Path, tmp_path: Path) -> None:
     board = tmp_path / "calibration_target.yaml"
     key = "boofcv.alg.fiducial.calib.ConfigCalibrationTarget"

@@ -215,3 +215,15 @@ def test_a_field_is_drawn_alone(tmp_path: Path) -> None:
     result = CliRunner().invoke(main, arguments, catch_exceptions=False)
     assert result.exit_code == 1
     assert "field: is drawn alone" in result.stderr
+
+
+def test_a_field_toml_is_not_written_over_itself(tmp_path: Path) -> None:
+    path = tmp_path / "field.toml"
+    Path(_field_of_points(tmp_path, 0.0)).rename(path)
+    content = path.read_bytes()
+    arguments = ["target", "--field", str(path), "--out", str(tmp_path)]
+    result = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert result.exit_code == 1
+    assert "field.toml: describes the field and would be overwritten; write to" in result.stderr
+    assert path.read_bytes() == content
+    assert list(tmp_path.iterdir()) == [path]

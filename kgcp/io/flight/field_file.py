@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from kgcp.errors import KgcpError, SettingError
 from kgcp.io.files.safe_read import is_file
 from kgcp.io.files.sniff import ForeignFile
-from kgcp.io.flight.point_field_file import POINT_KEYS, point_field, point_lines
+from kgcp.io.flight.point_field_file import (
+    POINT_KEYS,
+    point_field,
+    point_lines,
+    points_file,
+)
 from kgcp.io.flight.toml_file import read_toml
 from kgcp.io.flight.toml_table import TomlTable
 from kgcp.io.formats.fields import FORMATS
@@ -68,6 +73,29 @@ def read_field(text: str, unit: str | None = None) -> AnyField:
         return FORMATS.reader(file)(file, None if unit is None else _METRES[unit])
     except SettingError as error:
         raise KgcpError(f"{path}: {error}") from None
+
+
+def keep_field_files(text: str, written: Iterable[Path]) -> None:
+    """Refuse to write over the files that `read_field` reads of a field.
+
+    Raises
+    ------
+    KgcpError
+        Naming the file.
+    """
+    path = Path(text)
+    if not is_file(path):
+        return
+    own = [path]
+    if path.suffix == ".toml":
+        table, _ = read_toml(path, FIELD_KEYS, "the field")
+        own += [points_file(table, path.parent)] if "points" in table else []
+    for target in written:
+        if target.exists() and any(target.samefile(file) for file in own):
+            raise KgcpError(
+                f"{target}: describes the field and would be overwritten; write to another folder",
+                option="out",
+            )
 
 
 def _from_shorthand(text: str, match: re.Match[str]) -> Field:

@@ -63,6 +63,11 @@ def point_field(
         return replace(made, flat_sd_m=table.vector("flat_sd_m", made.flat_sd_m))
 
 
+def points_file(table: TomlTable, folder: Path) -> Path:
+    """Return the file of the discs that `[points]` names."""
+    return table.table("points", _FILE_KEYS).existing_file("file", folder)
+
+
 def _code_ring(table: TomlTable) -> CodeRing:
     code = table.table("code", _CODE_KEYS)
     code.choice("kind", ("ring",))
@@ -95,7 +100,7 @@ def _from_table(table: TomlTable, diameter_m: float | None, inner_m: float) -> F
 def _from_file(
     table: TomlTable, folder: Path, diameter_m: float | None, inner_m: float
 ) -> tuple[FieldPoint, ...]:
-    path = table.table("points", _FILE_KEYS).existing_file("file", folder)
+    path = points_file(table, folder)
     columns = read_csv_columns(
         path, ("name",), _PLACE, (*_SDS, *_NORMAL, *_OTHERS), "[points] file"
     )

@@ -46,6 +46,8 @@ from kgcp.report.calibration.figures import draw_comparison, draw_figures
 from kgcp.report.calibration.page import CalibrationPage, CameraComparison, render_calibration
 
 CAMERA_FILE = "camera.toml"
+FIELD_FILES = ("field.toml", "field.csv")
+"""The field as stated, and as adjusted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,9 +127,10 @@ def write_results(
     exported = CalibratedCamera(calibration.camera, calibration.covariance.cov, numbers.rms_px)
     texts = dict(camera_file(exported, form) for form in formats)
     texts[CAMERA_FILE] = camera_toml(calibration.camera, calibration.covariance)
-    texts["field.toml"] = field_toml(calibration.field)
+    stated, adjusted = FIELD_FILES
+    texts[stated] = field_toml(calibration.field)
     discs = field_discs(calibration)
-    texts["field.csv"] = field_csv(discs)
+    texts[adjusted] = field_csv(discs)
     photos = photo_rows(calibration, made.misses, made.photos)
     summary = _summary(made, numbers, verdict, photos, comparison)
     texts["calibration.json"] = json.dumps(summary, indent=1) + "\n"
