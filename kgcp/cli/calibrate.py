@@ -175,7 +175,8 @@ def command(
         import json
 
         files = [str(path) for path in results.files]
-        click.echo(json.dumps({**results.summary, "files": files}))
+        told = {"files": files, "not_renewed": results.not_renewed}
+        click.echo(json.dumps({**results.summary, **told}))
     if log_json:
         log.event("summary", **results.summary)
     elif not is_quiet:
@@ -204,3 +205,6 @@ def _report(results: CalibrationResults) -> None:
         click.echo(f"advice: {sentence}", err=True)
     for path in results.files:
         click.echo(f"wrote {path}", err=True)
+    if results.not_renewed:
+        older = ", ".join(results.not_renewed)
+        click.echo(f"left as an earlier calibration wrote them: {older}", err=True)

@@ -161,6 +161,15 @@ def test_the_same_photographs_give_the_same_bytes(
     assert not list(tmp_path.glob(".*"))  # no journal is left
 
 
+def test_cameras_of_an_earlier_run_are_named(photos: Path, tmp_path: Path) -> None:
+    (tmp_path / "opencv.yml").write_text("older")
+    options = ("--jobs", "0", "--response", "linear", "--operator", "centroid", "--format", "ros")
+    result = run(photos, "--field", photos / "field.toml", "--out", tmp_path, *options, "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["not_renewed"] == ["opencv"]
+    assert "left as an earlier calibration wrote them: opencv" in result.stderr
+
+
 def test_the_field_may_be_free_and_the_lens_chosen(photos: Path, tmp_path: Path) -> None:
     chosen = ("--points", "free", "--model", "radial", "--operator", "centroid")
     field = photos / "field.toml"

@@ -7,8 +7,9 @@ conventions. A model that a format cannot hold is refused by name.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -291,6 +292,12 @@ def camera_file(made: CalibratedCamera, form: str) -> tuple[str, str]:
     """
     name, write = _FORMATS[form]
     return name, write(made)
+
+
+def not_renewed(folder: Path, written: Collection[Path]) -> tuple[str, ...]:
+    """Return the formats of which an earlier calibration has left a file not written now."""
+    paths = {form: folder / name for form, (name, _) in _FORMATS.items()}
+    return tuple(form for form, path in paths.items() if path not in written and path.exists())
 
 
 def _camera_matrix(camera: Camera) -> FloatArray:

@@ -17,7 +17,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.io.files.atomic import write_all
 from kgcp.io.flight.camera_file import camera_toml
 from kgcp.io.flight.field_file import field_toml
-from kgcp.io.formats.camera_writers import CalibratedCamera, camera_file
+from kgcp.io.formats.camera_writers import CalibratedCamera, camera_file, not_renewed
 from kgcp.io.tables.calibration import (
     FIELD_COLUMNS,
     OBSERVATION_COLUMNS,
@@ -55,6 +55,7 @@ class CalibrationResults:
     """What was written, and what it says."""
 
     files: tuple[Path, ...]
+    not_renewed: tuple[str, ...]  # formats of which an earlier run has left files
     numbers: CalibrationNumbers
     verdict: CalibrationVerdict
     photos: tuple[PhotoRow, ...]
@@ -150,7 +151,9 @@ def write_results(
         write_table(out / name, columns, rows, about)
     write_all({out / name: text.encode() for name, text in texts.items()})
     files = tuple(out / name for name in names)
-    return CalibrationResults(files, numbers, verdict, tuple(photos), summary)
+    return CalibrationResults(
+        files, not_renewed(out, files), numbers, verdict, tuple(photos), summary
+    )
 
 
 def _summary(
