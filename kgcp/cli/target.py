@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from click.core import ParameterSource
 
 from kgcp.cli.options import json_option
 
@@ -155,8 +156,22 @@ def command(
     from kgcp.targets.sheets import Paper, lay_out
 
     if field_text is not None:
-        if names or new_count or codes or plate_m is not None or flight is not None:
-            raise SettingError("field", "is drawn alone", "leave out FLIGHT and other targets")
+        source = click.get_current_context().get_parameter_source("dots")
+        has_dots = source is not ParameterSource.DEFAULT
+        given = {
+            "FLIGHT": flight,
+            "--target": names,
+            "--new": new_count,
+            "--code": codes,
+            "--diameter": diameter_m,
+            "--dots": has_dots,
+            "--plate": plate_m,
+            "--round": is_round,
+            "--holes": hole_mm,
+        }
+        others = [option for option, value in given.items() if value]
+        if others:
+            raise SettingError("field", "is drawn alone", f"leave out {', '.join(others)}")
         _draw_field(field_text, formats, Paper(paper), dpi, out, is_tiled=is_tiled, as_json=as_json)
         return
     is_new = bool(new_count or codes)

@@ -210,11 +210,16 @@ def test_a_field_with_depth_is_not_drawn(tmp_path: Path) -> None:
     assert result.stderr.count("\n") == 1
 
 
-def test_a_field_is_drawn_alone(tmp_path: Path) -> None:
-    arguments = ["target", "--field", "grid:9x6:25mm:14mm", "--new", "2", "--out", str(tmp_path)]
-    result = CliRunner().invoke(main, arguments, catch_exceptions=False)
+@pytest.mark.parametrize(
+    "options",
+    [("--new", "2"), ("--diameter", "0.2"), ("--dots", "4"), ("--round",), ("--holes", "8")],
+)
+def test_a_field_is_drawn_alone(tmp_path: Path, options: tuple[str, ...]) -> None:
+    field = ["target", "--field", "grid:9x6:25mm:14mm", "--out", str(tmp_path)]
+    result = CliRunner().invoke(main, [*field, *options], catch_exceptions=False)
     assert result.exit_code == 1
-    assert "field: is drawn alone" in result.stderr
+    assert f"field: is drawn alone; leave out {options[0]}" in result.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_field_toml_is_not_written_over_itself(tmp_path: Path) -> None:
