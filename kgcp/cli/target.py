@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 from click.core import ParameterSource
 
-from kgcp.cli.options import json_option
+from kgcp.cli.options import json_option, unit_option
 
 if TYPE_CHECKING:
     from kgcp.targets.layout import Target
@@ -40,8 +40,9 @@ PAPERS = ("fit", "A4", "A3", "A2", "A1", "A0")
     "field_text",
     metavar="FIELD",
     help="Draw a field of discs for 'kgcp calibrate' instead, and write its field.toml: FIELD is a"
-    " field.toml or a shorthand, grid:9x6:25mm:15mm.",
+    " field.toml, another program's board file or a shorthand, grid:9x6:25mm:15mm.",
 )
+@unit_option
 @click.option(
     "--code",
     "codes",
@@ -118,6 +119,7 @@ def command(
     *,
     new_count: int | None,
     field_text: str | None,
+    unit: str | None,
     codes: tuple[str, ...],
     diameter_m: float | None,
     dots: int,
@@ -172,8 +174,18 @@ def command(
         others = [option for option, value in given.items() if value]
         if others:
             raise SettingError("field", "is drawn alone", f"leave out {', '.join(others)}")
-        _draw_field(field_text, formats, Paper(paper), dpi, out, is_tiled=is_tiled, as_json=as_json)
+        _draw_field(
+            (field_text, unit),
+            formats,
+            Paper(paper),
+            dpi,
+            out,
+            is_tiled=is_tiled,
+            as_json=as_json,
+        )
         return
+    if unit is not None:
+        raise SettingError("unit", "is that of a field's board file", "give --field, too")
     is_new = bool(new_count or codes)
     if names and is_new:
         raise SettingError("target", "cannot be combined with --new or --code", "give one of them")
@@ -206,7 +218,7 @@ def command(
 
 
 def _draw_field(
-    text: str,
+    described: tuple[str, str | None],
     formats: Sequence[str],
     paper: Paper,
     dpi: int,
@@ -215,7 +227,7 @@ def _draw_field(
     is_tiled: bool,
     as_json: bool,
 ) -> None:
-    """Write the sheets of a field and its field.toml."""
+    """Write the sheets of a field, described by its text and a unit, and its field.toml."""
     import json
     import warnings
 
@@ -227,7 +239,8 @@ def _draw_field(
     from kgcp.targets.fields.layout import Field
     from kgcp.targets.sheets import lay_out
 
-    field = read_field(text)
+    text, unit = described
+    field = read_field(text, unit)
     try:
         drawing = draw_field(field)
     except SettingError as error:

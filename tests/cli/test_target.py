@@ -232,3 +232,21 @@ def test_a_field_toml_is_not_written_over_itself(tmp_path: Path) -> None:
     assert "field.toml: describes the field and would be overwritten; write to" in result.stderr
     assert path.read_bytes() == content
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_board_without_a_unit_is_drawn_with_the_one_given(tmp_path: Path) -> None:
+    board = tmp_path / "calibration_target.yaml"
+    key = "boofcv.alg.fiducial.calib.ConfigCalibrationTarget"
+    grid = "{numRows: 4, numCols: 5, shapeDistance: 3.0, shapeSize: 1.6}"
+    board.write_text(f"# BoofCV\n{key}:\n  grid: {grid}\n  type: CIRCLE_GRID\n")
+    arguments = ["target", "--field", str(board), "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert result.exit_code == 1
+    assert "does not state its unit" in result.stderr
+    result = CliRunner().invoke(main, [*arguments, "--unit", "cm"], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    field = read_field(str(tmp_path / "out" / "field.toml"))
+    assert isinstance(field, Field)
+    assert field.pitch_m == pytest.approx(0.03)
+    result = CliRunner().invoke(main, ["target", "--new", "2", "--unit", "cm"])
+    assert "unit: is that of a field's board file; give --field, too" in result.stderr
