@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -135,7 +136,7 @@ def test_pixels_beyond_the_fold_are_nan_and_leave_the_others_alone() -> None:
     assert inside[0] < np.sqrt(2.0 / 3.0), "the branch that holds the optical axis"
 
 
-FOLDED = {
+FOLDED: dict[str, dict[str, Any]] = {
     "one term": {"k1": -0.3},
     "three terms": {"k1": -0.28, "k2": 0.07, "k3": -0.008},
     "turned twice": {"k1": -0.5, "k2": 0.1},

@@ -90,11 +90,18 @@ def test_what_was_measured_with_another_tone_is_measured_anew(tmp_path: Path) ->
     pool, kinds = MeasuringPool(1, SerialExecutor(), (), Counter()), (PhotoDiscs, PhotoMiss)
     tones = (None, replace(UNRELIABLE, known=ProcessingPrior.usual()), UNRELIABLE, UNRELIABLE)
     results = []
-    with Journal(tmp_path / "journal", {"by": "test"}, kinds, is_new=False) as journal:
+    opened = Journal[PhotoDiscs | PhotoMiss](
+        tmp_path / "journal", {"by": "test"}, kinds, is_new=False
+    )
+    with opened as journal:
         for index, tone in enumerate(tones):
             result = PhotoMiss(photo.name, 0, 0, "too_few", f"look {index}")
+
+            def measure(_: Photo, result: PhotoMiss = result) -> PhotoMiss:
+                return result
+
             looks = _Looks(journal, pool, NoProgress(), tone)
-            results += looks.through("photographs", [photo], [photo.name], lambda _, r=result: r)
+            results += looks.through("photographs", [photo], [photo.name], measure)
     details = [result.detail for result in results if isinstance(result, PhotoMiss)]
     assert details == ["look 0", "look 1", "look 2", "look 2"]
 
