@@ -38,6 +38,14 @@ def is_sound(value: float) -> bool:
     return abs(value) < LARGEST
 
 
+def whole(value: float | str) -> int:
+    """Return a number of things; `ValueError` if it has a fraction."""
+    number = float(value)
+    if number != int(number):
+        raise ValueError(f"{number:g} is not a whole number")
+    return int(number)
+
+
 def is_number(text: str) -> bool:
     """Return whether this is the text of a sound number."""
     try:

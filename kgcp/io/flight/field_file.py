@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -17,6 +16,7 @@ from kgcp.io.flight.point_field_file import (
     point_lines,
     points_file,
 )
+from kgcp.io.flight.toml_draft import toml_text
 from kgcp.io.flight.toml_file import read_toml
 from kgcp.io.flight.toml_table import TomlTable
 from kgcp.io.formats.fields import FORMATS
@@ -191,7 +191,7 @@ def _bars(table: TomlTable) -> tuple[FieldBar, ...]:
 def field_toml(field: AnyField) -> str:
     """Return the text of a field.toml, which `read_field` reads back to the same field."""
     lines = [
-        f"name = {json.dumps(field.name)}",
+        f"name = {toml_text(field.name)}",
         f'polarity = "{field.polarity.value}"',
         f"flat_sd_m = {list(field.flat_sd_m)}",
         *(point_lines(field) if isinstance(field, PointField) else _grid_lines(field)),
@@ -199,8 +199,8 @@ def field_toml(field: AnyField) -> str:
     for bar in field.bars:
         lines += [
             "\n[[bar]]",
-            f"from = {json.dumps(bar.first)}",
-            f"to = {json.dumps(bar.second)}",
+            f"from = {toml_text(bar.first)}",
+            f"to = {toml_text(bar.second)}",
             f"length_m = {bar.length_m!r}",
             f"sd_m = {bar.sd_m!r}",
         ]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
 from kgcp.errors import KgcpError
 from kgcp.io.files.csv_columns import CsvColumns, read_csv_columns
+from kgcp.io.flight.toml_draft import toml_text
 from kgcp.io.flight.toml_table import TomlTable
 from kgcp.targets.fields.layout import FieldBar, FieldPolarity
 from kgcp.targets.fields.points import CodeRing, FieldPoint, PointField
@@ -154,7 +154,7 @@ def point_lines(field: PointField) -> Iterator[str]:
         yield from ("\n[code]", 'kind = "ring"', f"bits = {field.code.bits}", f"ring = {ring}")
     for point in field.points:
         yield "\n[[point]]"
-        yield f"name = {json.dumps(point.name)}"
+        yield f"name = {toml_text(point.name)}"
         yield f"position_m = {list(point.position_m)}"
         yield f"diameter_m = {point.diameter_m!r}"
         if point.inner_diameter_m:

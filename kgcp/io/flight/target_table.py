@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from kgcp.io.files.atomic import write_bytes
 from kgcp.io.files.sniff import ForeignFile
+from kgcp.io.flight.toml_draft import toml_text
 from kgcp.io.flight.toml_table import TomlTable
 from kgcp.io.formats.visiona_target import read_visiona_ring
 from kgcp.settings import require_range
@@ -222,7 +222,7 @@ def target_lines(target: Target) -> Iterator[str]:
     """Yield the lines of a target's tables, its replicas after it; each begins with a gap."""
     ring = target.ring
     yield "\n[[target]]"
-    yield f"name = {json.dumps(ring.name)}"
+    yield f"name = {toml_text(ring.name)}"
     for key in _DIAMETERS:
         yield f"{key} = {getattr(ring, key)!r}"
     yield _code_line(ring)
@@ -234,8 +234,8 @@ def target_lines(target: Target) -> Iterator[str]:
             yield f"sd_position_m = {list(target.sd_position_m)}"
     for replica in target.replicas:
         yield "\n[[target]]"
-        yield f"name = {json.dumps(replica.name)}"
-        yield f"replica_of = {json.dumps(ring.name)}"
+        yield f"name = {toml_text(replica.name)}"
+        yield f"replica_of = {toml_text(ring.name)}"
         yield f"scale = {replica.outer_diameter_m / ring.outer_diameter_m:.12g}"
         yield _code_line(replica)
 

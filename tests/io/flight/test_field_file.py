@@ -163,7 +163,15 @@ def test_rings_lie_as_ringgrid_prints_them(tmp_path: Path, rows: int, longest: i
     assert first[:, 0].mean() == pytest.approx(second[:, 0].mean())  # both about the middle
 
 
-@pytest.mark.parametrize(("name", "called"), [("", "target"), ("a\nb", "target"), ("a b", "a b")])
+@pytest.mark.parametrize(
+    ("name", "called"),
+    [
+        ("", "target"),
+        ("a\nb", "target"),
+        ("a b", "a b"),
+        ("\N{GRINNING FACE}", "\N{GRINNING FACE}"),
+    ],
+)
 def test_names_of_rings_can_be_written(tmp_path: Path, name: str, called: str) -> None:
     field = read_grid(write(tmp_path, "target.json", ringgrid(name=name)))
     assert field.name == called
@@ -242,12 +250,19 @@ def test_wrong_field_toml(tmp_path: Path, old: str, new: str, message: str) -> N
         (BOOFCV, "CIRCLE_HEXAGONAL", "CHESSBOARD"),
         (BOOFCV, "numRows: 24", "numRows: many"),
         (BOOFCV, "numRows: 24", "numRows: .inf"),
+        (BOOFCV, "numRows: 24", "numRows: 24.7"),
         (BOOFCV, "1.2", "1e999"),
         (DICE, 'value="7.0"', 'value="nan"'),
         (DICE, "WHITE_ON_BLACK_W_DONUT_DOTS", "CHECKER_BOARD"),
         (DICE, "cal_origin_x", "origin"),
         (ROS, "spacing: 0.0254", "spacing: []"),
         (ROS, "rows: 10", "rows: 1e300"),
+        (ROS, "rows: 10", "rows: 10.5"),
+        (
+            DICE,
+            'num_cal_fiducials_x" type="int" value="14"',
+            'num_cal_fiducials_x" type="int" value="14.7"',
+        ),
         (ROS, "rows: 10", "rows: -3"),
     ],
 )

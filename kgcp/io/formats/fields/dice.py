@@ -7,6 +7,7 @@ Lengths are millimetres. The file does not say how large the dots are.
 
 from __future__ import annotations
 
+from kgcp.io.files.safe_read import whole
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.targets.fields.layout import Field, FieldPolarity, GridKind, Mark
 
@@ -34,7 +35,11 @@ def field(file: ForeignFile, unit_m: float | None) -> Field:  # noqa: ARG001 - a
         )
 
     def count(key: str) -> int:
-        return int(file.numbers(values.get(key), 1, key)[0])
+        (value,) = file.numbers(values.get(key), 1, key)
+        try:
+            return whole(value)
+        except ValueError as error:
+            raise file.error(f"{key}: {error}") from error
 
     columns, rows = count("num_cal_fiducials_x"), count("num_cal_fiducials_y")
     spacing = file.numbers(values.get("cal_target_spacing_size"), 1, "cal_target_spacing_size")
