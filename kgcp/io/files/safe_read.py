@@ -38,7 +38,7 @@ def is_sound(value: float) -> bool:
     return abs(value) < LARGEST
 
 
-def whole(value: float | str) -> int:
+def whole_number(value: float | str) -> int:
     """Return a number of things; `ValueError` if it has a fraction."""
     number = float(value)
     if number != int(number):

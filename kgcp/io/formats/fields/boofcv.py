@@ -6,7 +6,7 @@ Its numbers have the unit that whoever printed the target chose, and does not sa
 from __future__ import annotations
 
 from kgcp.errors import KgcpError
-from kgcp.io.files.safe_read import is_sound, whole
+from kgcp.io.files.safe_read import is_sound, whole_number
 from kgcp.io.files.safe_yaml import load_yaml
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.targets.fields.layout import Field, GridKind
@@ -26,7 +26,7 @@ def field(file: ForeignFile, unit_m: float | None) -> Field:
         document = load_yaml(file.text)
         target = document[_KEY] if isinstance(document, dict) else {}
         kind, grid = str(target["type"]), target["grid"]
-        rows, columns = whole(grid["numRows"]), whole(grid["numCols"])
+        rows, columns = whole_number(grid["numRows"]), whole_number(grid["numCols"])
         size, distance = float(grid["shapeSize"]), float(grid["shapeDistance"])
     except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise file.error(f"is not a calibration target of BoofCV ({error})") from error

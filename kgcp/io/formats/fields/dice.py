@@ -7,7 +7,7 @@ Lengths are millimetres. The file does not say how large the dots are.
 
 from __future__ import annotations
 
-from kgcp.io.files.safe_read import whole
+from kgcp.io.files.safe_read import whole_number
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.targets.fields.layout import Field, FieldPolarity, GridKind, Mark
 
@@ -37,7 +37,7 @@ def field(file: ForeignFile, unit_m: float | None) -> Field:  # noqa: ARG001 - a
     def count(key: str) -> int:
         (value,) = file.numbers(values.get(key), 1, key)
         try:
-            return whole(value)
+            return whole_number(value)
         except ValueError as error:
             raise file.error(f"{key}: {error}") from error
 

@@ -6,7 +6,7 @@ file does not say how large the dots are.
 
 from __future__ import annotations
 
-from kgcp.io.files.safe_read import is_sound, whole
+from kgcp.io.files.safe_read import is_sound, whole_number
 from kgcp.io.files.safe_yaml import load_yaml
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.targets.fields.layout import Field, GridKind, Mark
@@ -25,7 +25,7 @@ def field(file: ForeignFile, unit_m: float | None) -> Field:  # noqa: ARG001 - a
     try:
         document = load_yaml(file.text)
         finder = document["target_finder"] if isinstance(document, dict) else {}
-        rows, columns = whole(finder["rows"]), whole(finder["cols"])
+        rows, columns = whole_number(finder["rows"]), whole_number(finder["cols"])
         spacing = float(finder["spacing"])
     except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise file.error(f"is not a cal_data.yaml with a circle grid ({error})") from error
