@@ -146,7 +146,7 @@ def command(
         start_server("kgcp.pipeline.calibration.photographs")  # while this process loads the rest
 
     from kgcp.geometry.camera import Response
-    from kgcp.io.flight.field_file import keep_field_files, read_field
+    from kgcp.io.flight.field_file import read_field, refuse_to_overwrite_field
     from kgcp.measurement.discs.records import Operator
     from kgcp.network.calibration_records import CalibrationSettings, LensModel, PointModel
     from kgcp.pipeline.calibration.against import read_other
@@ -157,7 +157,7 @@ def command(
     from kgcp.pipeline.calibration.results import FIELD_FILES, settings_for, write_results
 
     field = read_field(field_text, unit)
-    keep_field_files(field_text, [out / name for name in FIELD_FILES])
+    refuse_to_overwrite_field(field_text, [out / name for name in FIELD_FILES])
     settings = CalibrationSettings(PointModel(points), LensModel(lens), is_same_aspect)
     options = CalibrationOptions(
         settings_for(formats, settings),

@@ -175,7 +175,8 @@ def command(
         if others:
             raise SettingError("field", "is drawn alone", f"leave out {', '.join(others)}")
         _draw_field(
-            (field_text, unit),
+            field_text,
+            unit,
             formats,
             Paper(paper),
             dpi,
@@ -218,7 +219,8 @@ def command(
 
 
 def _draw_field(
-    described: tuple[str, str | None],
+    text: str,
+    unit: str | None,
     formats: Sequence[str],
     paper: Paper,
     dpi: int,
@@ -227,19 +229,18 @@ def _draw_field(
     is_tiled: bool,
     as_json: bool,
 ) -> None:
-    """Write the sheets of a field, described by its text and a unit, and its field.toml."""
+    """Write the sheets of a field and its field.toml."""
     import json
     import warnings
 
     from kgcp.errors import KgcpError, KgcpWarning, SettingError
     from kgcp.io.files.atomic import write_bytes
-    from kgcp.io.flight.field_file import field_toml, keep_field_files, read_field
+    from kgcp.io.flight.field_file import field_toml, read_field, refuse_to_overwrite_field
     from kgcp.io.print.write import write_sheets
     from kgcp.targets.fields.artwork import draw_field
     from kgcp.targets.fields.layout import Field
     from kgcp.targets.sheets import lay_out
 
-    text, unit = described
     field = read_field(text, unit)
     try:
         drawing = draw_field(field)
@@ -248,7 +249,7 @@ def _draw_field(
     sheets = lay_out(drawing, "the field", paper, is_tiled=is_tiled)
     folder = out or Path("targets")
     description = folder / "field.toml"
-    keep_field_files(text, [description])
+    refuse_to_overwrite_field(text, [description])
     files = write_sheets(sheets, "field", folder, formats, dpi)
     write_bytes(description, field_toml(field).encode())
     files.append(description)

@@ -17,7 +17,7 @@ def full_scale(grey: GreyArray) -> float:
 def brightest_level(grey: GreyArray) -> float:
     """Return what counts as white in a frame: the end of 8 bits, or its own brightest pixels.
 
-    A 16-bit frame often holds 10 or 12 bits. Shares of its data type's range say nothing of it.
+    A 16-bit frame often holds 10 or 12 bits, so that a share of its data type's range means little.
     """
     if grey.dtype != np.uint16:
         return full_scale(grey)

@@ -36,7 +36,8 @@ class Gcp:
     position_map : (3,) array
         x, y, z in the flight's CRS.
     cov_m2 : (3, 3) array or None
-        Covariance along the map's axes [m²]; None: the trajectory has no standard deviations.
+        Covariance along the map's axes [m²]; None: trajectory or static target have no standard
+        deviations.
     centre_px, centre_cov_px2, distance_m, sd_distance_m, sd_common_distance_m
         As in the sighting.
     common_m : (3, k) array or None

@@ -177,8 +177,8 @@ class Motion:
 def _spread_samples(time_s: FloatArray) -> IndexArray:
     """Return which of n ≥ 2 samples a spline goes through: the ends, and none too close to another.
 
-    Steps may shorten by `_EVEN_RATIO` beside a long one, and farther in proportion to the time
-    from there.
+    Beside a long step, the next one may be shorter by `_EVEN_RATIO`. Farther away from it, steps
+    may be shorter still, in proportion to the time.
     """
     steps = np.diff(time_s)
     # (n - 1,): the longest step, less the time from it, at the samples after and before steps

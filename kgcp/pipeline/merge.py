@@ -10,13 +10,7 @@ from pathlib import Path
 
 from kgcp.errors import KgcpError
 from kgcp.georef.camera_priors import CameraPrior
-from kgcp.georef.gcp import (
-    Gcp,
-    SkippedSighting,
-    check_ids,
-    flight_prefix,
-    with_flight_name,
-)
+from kgcp.georef.gcp import Gcp, SkippedSighting, check_ids, flight_prefix, with_flight_name
 from kgcp.io.exporters.formats import DEFAULT_FORMATS
 from kgcp.io.exporters.points import MapPoints
 from kgcp.io.exporters.weights import MARK_FLOOR_PX

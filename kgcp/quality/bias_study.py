@@ -45,8 +45,8 @@ class ReferenceSds:
     ) -> Self | None:
         """Return those along a line of sight: a unit vector (3,) in the ENU frame.
 
-        `row` is that of the frame among the reference poses. None where trajectory or poses have
-        no standard deviations.
+        `row` is that of the frame among the reference poses. None where trajectory, static target
+        or poses have no standard deviations.
         """
         if position.cov_m2 is None or orientations.cov_m2 is None:
             return None

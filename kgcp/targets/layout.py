@@ -129,7 +129,7 @@ class Target:
     position_m : tuple of float or None
         Position of a static target in the flight's CRS [m]; None for one on the vehicle.
     sd_position_m : tuple of float
-        Its standard deviations [m].
+        Its standard deviations [m]; zeros: unknown.
     """
 
     ring: Ring

@@ -49,7 +49,7 @@ class PlainTarget:
     polarity : PlainPolarity
         Of the area directly within the outer circle, against the ground.
     position_m, sd_position_m : tuple of float
-        Position in the flight's CRS, and its standard deviations [m].
+        Position in the flight's CRS, and its standard deviations [m]; zeros: unknown.
     sd_diameter_m : float
         How well the outer diameter is known [m]; the others are wrong by the same factor.
     normal_enu : (3,) tuple of float, or None

@@ -245,19 +245,25 @@ def test_foreign_tables_are_recognised_shown_and_readable(
         assert flight.vehicle.options.time_system == "utc"
 
 
+def with_track(bare: Path, tmp_path: Path, head: str, ahead_s: float = 0.0) -> Path:
+    """A folder whose only trajectory is a table of time and place, with a clock that is ahead."""
+    folder = copied(bare, "dji", tmp_path)
+    (folder / "rover.pos").unlink()
+    track = PLAN.trajectory
+    rows = [
+        f"{time_s + ahead_s:.6f},{x},{y},{z}"
+        for time_s, (x, y, z) in zip(
+            track.time_s.tolist(), track.position_map.tolist(), strict=True
+        )
+    ]
+    (folder / "track.csv").write_text("\n".join((head, *rows)), encoding="utf-8")
+    return folder
+
+
 def test_seconds_in_a_column_of_gps_time_are_assumed_to_be_gps_time(
     bare: Path, tmp_path: Path
 ) -> None:
-    folder = copied(bare, "dji", tmp_path)
-    (folder / "rover.pos").unlink()
-    rows = ["gps_time,E,N,H"]
-    rows += [
-        f"{time_s + 18.0:.3f},{x},{y},{z}"
-        for time_s, (x, y, z) in zip(
-            PLAN.trajectory.time_s.tolist(), PLAN.trajectory.position_map.tolist(), strict=True
-        )
-    ]
-    (folder / "track.csv").write_text("\n".join(rows), encoding="utf-8")
+    folder = with_track(bare, tmp_path, "gps_time,E,N,H", ahead_s=18.0)
     _, data, said = made(folder, *TARGET, *ARM, "--crs", "EPSG:25832")
     assert data.trajectory is not None
     assert data.trajectory.time_s == pytest.approx(PLAN.trajectory.time_s, abs=1e-3)
@@ -287,16 +293,7 @@ def test_date_and_time_in_two_columns_are_to_be_joined(
 
 
 def test_east_north_up_are_a_place(bare: Path, tmp_path: Path) -> None:
-    folder = copied(bare, "dji", tmp_path)
-    (folder / "rover.pos").unlink()
-    rows = ["time,E,N,U"]
-    rows += [
-        f"{time_s},{x},{y},{z}"
-        for time_s, (x, y, z) in zip(
-            PLAN.trajectory.time_s.tolist(), PLAN.trajectory.position_map.tolist(), strict=True
-        )
-    ]
-    (folder / "track.csv").write_text("\n".join(rows), encoding="utf-8")
+    folder = with_track(bare, tmp_path, "time,E,N,U")
     _, data, said = made(folder, *TARGET, *ARM, "--crs", "EPSG:25832")
     assert place_errors_m(data) < 1e-5
     assert "z = 'U'" in said

@@ -47,8 +47,8 @@ def files(points: MapPoints) -> Mapping[str, str]:
     Raises
     ------
     KgcpError
-        If there is no prior with a covariance, or an image's path has white space, a
-        comma or a quote.
+        If there is no prior with a covariance, or an image's path has white space, a comma or a
+        quote.
     """
     names = image_names(
         (prior.frame for prior in points.priors), _FOLDER, r'\s,"', keep_folder=True

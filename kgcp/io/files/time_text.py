@@ -16,8 +16,7 @@ NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
 _GPS_WEEK = re.compile(r"\d{4}[\s:;/]+\d{1,6}(\.\d*)?")
 _DAY = re.compile(r"\d{1,4}([-./])\d{1,2}\1\d{1,4}")
 _CLOCK = re.compile(r"\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?Z?")
-JOINING = "join date and time in one column, as 2026-05-04T09:30:05.25Z"
-"""What to do with times in two columns."""
+_JOIN = "join date and time in one column, as 2026-05-04T09:30:05.25Z, or give Unix seconds"
 _REMEDY = "give UTC as 2026-05-04T09:30:05.25Z or as Unix seconds"
 
 
@@ -52,7 +51,7 @@ def parse_time(text: str) -> float:
         )
     half = half_of_time(text)
     if half is not None:
-        raise SettingError("time", f"{text!r} is {half}", f"{JOINING}, or give Unix seconds")
+        raise SettingError("time", f"{text!r} is {half}", _JOIN)
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:

@@ -10,12 +10,7 @@ from typing import Any
 from kgcp.errors import KgcpError, SettingError
 from kgcp.io.files.safe_read import is_file
 from kgcp.io.files.sniff import ForeignFile
-from kgcp.io.flight.point_field_file import (
-    POINT_KEYS,
-    point_field,
-    point_lines,
-    points_file,
-)
+from kgcp.io.flight.point_field_file import POINT_KEYS, point_field, point_lines, points_file
 from kgcp.io.flight.toml_draft import toml_text
 from kgcp.io.flight.toml_file import read_toml
 from kgcp.io.flight.toml_table import TomlTable
@@ -75,7 +70,7 @@ def read_field(text: str, unit: str | None = None) -> AnyField:
         raise KgcpError(f"{path}: {error}") from None
 
 
-def keep_field_files(text: str, written: Iterable[Path]) -> None:
+def refuse_to_overwrite_field(text: str, written: Iterable[Path]) -> None:
     """Refuse to write over the files that `read_field` reads of a field.
 
     Raises

@@ -18,12 +18,7 @@ from hypothesis import strategies as st
 
 from kgcp.georef.gcp import Gcp
 from kgcp.io.exporters.points import MapPoints
-from kgcp.io.exporters.weights import (
-    ASSUMED_SHARE,
-    POINT_FLOOR_M,
-    distance_share,
-    with_floors,
-)
+from kgcp.io.exporters.weights import ASSUMED_SHARE, POINT_FLOOR_M, distance_share, with_floors
 from kgcp.io.exporters.write import export
 
 Factory = Callable[..., MapPoints]
