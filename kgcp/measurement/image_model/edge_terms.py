@@ -80,8 +80,9 @@ def _add_skew(
 ) -> None:
     """Add −⅙ of the third derivatives of the blurred discs.
 
-    Along normal n and tangent t of its edge, a disc that is blurred to C at the distance ρ from its
-    centre has ∂ₙₙₙC = (1 − z²) φ(z) / σ³ and, since the edge is bent, ∂ₙₜₜC = C″/ρ − C′/ρ².
+    Along normal n and tangent t of its edge, a disc that is blurred to C has
+    ∂ₙₙₙC = (1 − z²) φ(z) / σ³ and, since the edge is bent with the radius ρ in the image,
+    ∂ₙₜₜC = C″/ρ − C′/ρ².
     """
     w = np.ones(14 * _BATCH)
     for c in range(len(circles)):
@@ -94,9 +95,10 @@ def _add_skew(
                 sd = math.sqrt(xx * nx * nx + 2.0 * xy * nx * ny + yy * ny * ny)
                 z = (radius_m - w[_OUT + j]) / (w[_PER_PX + j] * sd)
                 density = _density(z)
-                out_px = max(w[_OUT + j] / w[_PER_PX + j], sd)
+                along_m = _step_along(w, j)
+                bend_px = max(w[_OUT + j] * w[_PER_PX + j] / (along_m * along_m), sd)
                 third = (1.0 - z * z) * density / (sd * sd * sd)
-                bent = (-z / (sd * sd) + 1.0 / (sd * out_px)) * density / out_px
+                bent = (-z / (sd * sd) + 1.0 / (sd * bend_px)) * density / bend_px
                 tx, ty = -ny, nx
                 w[_FIRST + j] = factor * (third * nx * nx * nx + 3.0 * bent * nx * tx * tx)
                 mixed = third * nx * nx * ny + bent * (2.0 * nx * tx * ty + tx * tx * ny)
@@ -145,9 +147,7 @@ def _add_smoothing(
                 nx, ny = w[_NORMAL_X + j], w[_NORMAL_Y + j]
                 sd_m = w[_PER_PX + j] * math.sqrt(xx * nx * nx + 2.0 * xy * nx * ny + yy * ny * ny)
                 density = _density((radius_m - w[_OUT + j]) / sd_m) / sd_m
-                step_x = w[_X_DOWN + j] * nx - w[_X_RIGHT + j] * ny
-                step_y = w[_Y_DOWN + j] * nx - w[_Y_RIGHT + j] * ny
-                along_m = (w[_X + j] * step_y - w[_Y + j] * step_x) / w[_OUT + j]
+                along_m = _step_along(w, j)
                 w[_FIRST + j] = -sign * density * along_m * along_m / (2.0 * radius_m)
             _add_results(w, pixels, rows)
 
@@ -210,6 +210,16 @@ def _gather_edges(views: FloatArray, circle: FloatArray, pixels: IndexArray, w: 
         per_px = math.sqrt(right * right + down * down)
         w[_OUT + j], w[_PER_PX + j] = out_m, per_px
         w[_NORMAL_X + j], w[_NORMAL_Y + j] = right / per_px, down / per_px
+
+
+@inlined
+def _step_along(w: FloatArray, j: int) -> float:
+    """Return the step along the circle [m] that a pixel's step along the contour is."""
+    nx, ny = w[_NORMAL_X + j], w[_NORMAL_Y + j]
+    step_x = w[_X_DOWN + j] * nx - w[_X_RIGHT + j] * ny
+    step_y = w[_Y_DOWN + j] * nx - w[_Y_RIGHT + j] * ny
+    along_m: float = (w[_X + j] * step_y - w[_Y + j] * step_x) / w[_OUT + j]
+    return along_m
 
 
 @inlined
