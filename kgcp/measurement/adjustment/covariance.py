@@ -38,6 +38,7 @@ from kgcp.measurement.image_model.photometry import (
     Tone,
     plateau_levels,
 )
+from kgcp.measurement.image_model.residual_agreement import sums_over_arcs
 from kgcp.measurement.image_model.rolling_shutter import RollingShutter
 from kgcp.measurement.image_model.rotation_displacement import mean_square_displacement
 from kgcp.measurement.records import Uncertainty
@@ -116,7 +117,7 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
     by_pixel = np.zeros((scaled.shape[1], -(-len(scaled) // _VECTOR) * _VECTOR))
     by_pixel[:, : len(scaled)] = scaled.T
     of_pose = by_pixel[:, : len(scaled)] @ to_pose.T
-    sums, products, arcs = _over_arcs(of_pose, by_pixel, misfit.score, misfit.weight, arc)
+    sums, products, arcs = sums_over_arcs(of_pose, by_pixel, misfit.score, misfit.weight, arc)
     products = products[:, :, : len(scaled)]
     # of an arc whose normal matrix is A, a fit to independent residuals leaves A − A N⁻¹ A
     left = np.sum(products.sum(axis=0) * to_pose) - np.sum((products @ inverse) * products)
@@ -307,29 +308,6 @@ def _number_arcs(
         turn -= math.floor(turn)
         arc[i] = int(firsts[c] + min(math.floor(turn * counts[c]), counts[c] - 1.0))
     return circle, arc
-
-
-@compiled
-def _over_arcs(
-    of_pose: FloatArray, of_all: FloatArray, score: FloatArray, weight: FloatArray, arc: IndexArray
-) -> tuple[FloatArray, FloatArray, int]:
-    """Return sums over arcs, and how many of them have pixels.
-
-    Of the scores with derivatives `of_pose` (n, 6): (arcs, 6); and of the products of these and
-    those `of_all` (n, p): (arcs, 6, p).
-    """
-    count, room = arc.max() + 1, of_all.shape[1]
-    sums, products = np.zeros((count, 6)), np.zeros((count, 6, room))
-    pixels = np.zeros(count, np.intp)
-    for i in range(len(arc)):
-        a = arc[i]
-        pixels[a] += 1
-        for k in range(6):
-            sums[a, k] += of_pose[i, k] * score[i]
-            weighted = of_pose[i, k] * weight[i]
-            for j in range(room):
-                products[a, k, j] += weighted * of_all[i, j]
-    return sums, products, (pixels > 0).sum()
 
 
 def spread_over_both(pose: Pose, other: Pose, ambiguity: float) -> FloatArray:

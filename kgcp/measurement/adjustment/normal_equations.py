@@ -16,7 +16,9 @@ from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.image_model.noise import Misfit
 from kgcp.measurement.image_model.photometry import PARAM_COUNT, SHAPE_PARAMS
 
-_LIKE_A_TILT = 0.07  # of the distance: a tilt of 1 rad is damped at least like such a change
+LIKE_A_TILT = 0.07
+"""Of the distance: a tilt of 1 rad is damped at least like such a change."""
+
 _DEPTH, _FIRST_TURN, _LAST_TURN = 2, 3, 5  # among the parameters
 
 
@@ -170,7 +172,7 @@ def _damped_equations(
     changes.
     """
     damped, gradient = normal.copy(), scaled @ score
-    reach_m = _LIKE_A_TILT * math.sqrt((translation_m**2).sum())
+    reach_m = LIKE_A_TILT * math.sqrt((translation_m**2).sum())
     for k in range(len(free)):
         row, stiffness = free[k], normal[k, k]
         if _FIRST_TURN <= row <= _LAST_TURN:

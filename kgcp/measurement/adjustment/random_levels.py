@@ -24,6 +24,7 @@ from kgcp.measurement.adjustment.level_equations import (
     gather,
 )
 from kgcp.measurement.adjustment.normal_equations import (
+    LIKE_A_TILT,
     Unknowns,
     normal_matrix,
     scaled_rows,
@@ -72,7 +73,6 @@ _HOPELESS, _HOPELESS_AT_ONCE = 5000.0, 15000.0
 # nearly the same, so that a Jacobian that is off by some per cent promises what no step can gain:
 # steps went on with a tenth of what they promised, until their number was used up.
 _LARGE_GAIN = 1.0
-_LIKE_A_TILT = 0.07  # as in `normal_equations`
 _SETTLED_PX = 0.1
 _LEAST_SD, _MOST_SD, _FIRST_SD = 1e-4, 1.0, 0.1  # of the levels' prior, of the contrast
 _FINEST_PX, _FINE, _COARSE = 8.0, 6.0, 0.8  # knots: px, per radius, and radii apart
@@ -380,6 +380,6 @@ class _WithLevels:
 def _damped(normal: FloatArray, parameters: Parameters, damping: float) -> FloatArray:
     """Add to the diagonal; tilts are held back like the distance, as in `normal_equations`."""
     stiffness = np.diag(normal).copy()
-    reach_m = _LIKE_A_TILT * float(np.linalg.norm(parameters.matrix[:, 3]))
+    reach_m = LIKE_A_TILT * float(np.linalg.norm(parameters.matrix[:, 3]))
     stiffness[3:6] = np.maximum(stiffness[3:6], reach_m * reach_m * stiffness[2])
     return np.asarray(normal + np.diag(damping * stiffness))

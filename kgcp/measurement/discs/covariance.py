@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtri
 
-from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.discs.affine_model import Geometry, mean_radius_px
 from kgcp.measurement.discs.disc_levels import GEOMETRY_COUNT
@@ -23,6 +22,7 @@ from kgcp.measurement.discs.fit_disc import DiscFit
 from kgcp.measurement.discs.pixel_choice import outward_px
 from kgcp.measurement.image_model.noise import median_at_edges
 from kgcp.measurement.image_model.photometry import Tone
+from kgcp.measurement.image_model.residual_agreement import sums_over_arcs
 
 _ARC_PX = 6.0
 _FEWEST_ARCS = 8
@@ -99,9 +99,9 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
     to_own = np.linalg.solve(root, own)  # in units of N⁻¹
     of_own, of_all = np.ascontiguousarray((to_own @ scaled).T), np.ascontiguousarray(scaled.T)
     score, weight = fit.misfit.score, fit.misfit.weight
-    sums, products, arcs = _over_arcs(of_own, of_all, score, weight, _arcs(fit))
+    sums, products, arcs = sums_over_arcs(of_own, of_all, score, weight, _arcs(fit))
     ratio = scatter_ratio(sums, products, to_own, inverse)
-    sums, products, _ = _over_arcs(of_own, of_all, score, weight, _blocks(fit))
+    sums, products, _ = sums_over_arcs(of_own, of_all, score, weight, _blocks(fit))
     expected = max(_scatter_left(products, to_own, inverse), _NEARLY_NONE)
     shares = np.einsum("bkp,kp->b", products, to_own)
     equal = float(shares.sum() ** 2 / np.sum(shares * shares))
@@ -309,26 +309,3 @@ def _blocks(fit: DiscFit) -> IndexArray:
     columns, rows = fit.sample.pixels.places_px.astype(np.intp) // _BLOCK_PX
     numbers = rows * (fit.sample.window.frame_px // _BLOCK_PX + 1) + columns
     return np.unique(numbers, return_inverse=True)[1]
-
-
-@compiled
-def _over_arcs(
-    of_own: FloatArray, of_all: FloatArray, score: FloatArray, weight: FloatArray, arc: IndexArray
-) -> tuple[FloatArray, FloatArray, int]:
-    """Return sums over arcs, and how many of them have pixels.
-
-    Of the scores with derivatives `of_own` (n, 5): (arcs, 5); and of the products of these and
-    those `of_all` (n, p): (arcs, 5, p).
-    """
-    count, own, room = arc.max() + 1, of_own.shape[1], of_all.shape[1]
-    sums, products = np.zeros((count, own)), np.zeros((count, own, room))
-    pixels = np.zeros(count, np.intp)
-    for i in range(len(arc)):
-        a = arc[i]
-        pixels[a] += 1
-        for k in range(own):
-            sums[a, k] += of_own[i, k] * score[i]
-            weighted = of_own[i, k] * weight[i]
-            for j in range(room):
-                products[a, k, j] += weighted * of_all[i, j]
-    return sums, products, (pixels > 0).sum()

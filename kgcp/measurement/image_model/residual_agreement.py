@@ -1,0 +1,32 @@
+"""Sums over arcs of edges, which tell how far residuals along them agree."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import FloatArray, IndexArray
+
+
+@compiled
+def sums_over_arcs(
+    of_own: FloatArray, of_all: FloatArray, score: FloatArray, weight: FloatArray, arc: IndexArray
+) -> tuple[FloatArray, FloatArray, int]:
+    """Return sums over arcs, and how many of them have pixels.
+
+    Of the scores (n,) with some derivatives `of_own` (n, k): (arcs, k); and of the products of
+    these and of those `of_all` (n, p), weighted (n,): (arcs, k, p). `arc` (n,) is the number of
+    every pixel's arc.
+    """
+    count, own, room = arc.max() + 1, of_own.shape[1], of_all.shape[1]
+    sums, products = np.zeros((count, own)), np.zeros((count, own, room))
+    pixels = np.zeros(count, np.intp)
+    for i in range(len(arc)):
+        a = arc[i]
+        pixels[a] += 1
+        for k in range(own):
+            sums[a, k] += of_own[i, k] * score[i]
+            weighted = of_own[i, k] * weight[i]
+            for j in range(room):
+                products[a, k, j] += weighted * of_all[i, j]
+    return sums, products, (pixels > 0).sum()
