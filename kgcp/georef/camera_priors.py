@@ -28,6 +28,7 @@ from kgcp.geometry.attitude import (
 )
 from kgcp.geometry.pose import rotation_about
 from kgcp.georef.gcp import Gcp
+from kgcp.georef.interpolation_error import interpolation_errors
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPositions, Vehicle
@@ -149,8 +150,8 @@ def _oriented(
     level = vehicle.local_frame.level_rotations(states.position_m)
     plate = local_frame.enu_from_map(np.array([point.position_map for point, _ in pairs]))
     # East, north and up are those of the plate, whatever datum the points' CRS has.
-    level_from_body = np.swapaxes(level, -1, -2) @ states.frame_from_body
-    enu_from_body = local_frame.level_rotations(plate) @ level_from_body
+    enu_from_frame = local_frame.level_rotations(plate) @ np.swapaxes(level, -1, -2)
+    enu_from_body = enu_from_frame @ states.frame_from_body
     poses = [sighting.pose for _, sighting in pairs if sighting.pose is not None]
     plate_from_camera = np.swapaxes(np.array([pose.rotation for pose in poses]), -1, -2)
     mount = body_from_plate(vehicle.settings.mount_deg)
@@ -161,13 +162,15 @@ def _oriented(
     to_enu = local_frame.grid_rotation(plate)
     positions = local_frame.map_from_enu(camera)
     sds = states.sd_attitude_deg
+    cov_turns = interpolation_errors(vehicle.motion, time_s).cov_turn_rad2
     priors = []
     for i, (point, sighting) in enumerate(pairs):
         cov = None
         cov_pose = _whole_pose_cov(sighting)
         if point.cov_m2 is not None and cov_pose is not None and sds is not None:
             cov_plate = to_enu[i] @ point.cov_m2 @ to_enu[i].T
-            attitude = _Attitude(enu_from_body[i], sds[i], vehicle.settings)
+            cov_turn = enu_from_frame[i] @ cov_turns[i] @ enu_from_frame[i].T
+            attitude = _Attitude(enu_from_body[i], sds[i], cov_turn, vehicle.settings)
             turn = np.kron(np.eye(2), map_from_enu[i])
             cov = turn @ _cov(cov_plate, cov_pose, attitude, enu_from_camera[i], rays[i]) @ turn.T
         attitude_map = map_from_enu[i] @ enu_from_camera[i]
@@ -188,6 +191,7 @@ class _Attitude:
 
     enu_from_body: FloatArray
     sd_deg: FloatArray
+    cov_turn_rad2: FloatArray  # (3, 3): of its interpolation, a small rotation about ENU axes
     settings: VehicleSettings
 
 
@@ -210,7 +214,7 @@ def _cov(
     """
     body = vehicle.enu_from_body
     (turns,) = attitude_axes(body[None], np.array([[0.0, 0.0, -1.0]]))
-    cov_attitude = covariance_along(turns, np.radians(vehicle.sd_deg))
+    cov_attitude = covariance_along(turns, np.radians(vehicle.sd_deg)) + vehicle.cov_turn_rad2
     # Nothing else is known of the mount; without a deviation it counts as exact, as does its turn.
     tilt_sd = math.radians(vehicle.settings.level_sd_deg or 0.0)
     cov_mount = covariance_along(body[:, :2], np.full(2, tilt_sd))

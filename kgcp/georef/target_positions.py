@@ -13,8 +13,9 @@ import numpy as np
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.attitude import attitude_axes, covariance_along
+from kgcp.geometry.attitude import attitude_axes, covariance_along, cross_matrix
 from kgcp.georef.gps_counts import gps_count_remedy
+from kgcp.georef.interpolation_error import interpolation_errors
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.trajectory import ENU_FROM_NED, Coverage, Motion, States, Trajectory, body_to_ned
 from kgcp.settings import VehicleSettings
@@ -74,10 +75,12 @@ class Vehicle:
         """Return the target's positions at frame times (n,) that the trajectory covers.
 
         position = trajectory point + R(frame ← body) · lever arm. The covariance adds up, with
-        first-order propagation: trajectory, attitude times lever arm, lever arm, and the target's
-        velocity times the synchronisation. Attitude deviations that the file lacks count as zero.
+        first-order propagation: trajectory, attitude times lever arm, the interpolation of both,
+        lever arm, and the target's velocity times the synchronisation. Attitude deviations that
+        the file lacks count as zero.
         """
-        states = self.motion.states(time_s + self.settings.time_offset_s)
+        trajectory_s = time_s + self.settings.time_offset_s
+        states = self.motion.states(trajectory_s)
         lever = states.frame_from_body @ np.array(self.settings.lever_arm_m)
         velocity = states.velocity_m_s + np.cross(states.angular_velocity_rad_s, lever)
         common = self._common_effects(states.frame_from_body, velocity)
@@ -85,6 +88,7 @@ class Vehicle:
         if states.sd_position_m is not None:
             own = self._trajectory_cov(states, states.sd_position_m)
             own = own + self._attitude_cov(states, lever)
+            own = own + self._interpolation_cov(trajectory_s, lever)
             cov = list(own + common @ np.swapaxes(common, 1, 2))
         vehicle_states = map(VehicleState, velocity, states.frame_from_body)
         return list(map(TargetPosition, states.position_m + lever, cov, common, vehicle_states))
@@ -104,6 +108,14 @@ class Vehicle:
         axes = attitude_axes(states.frame_from_body, -up)
         effects = np.cross(axes, lever[:, :, None], axisa=1, axisb=1, axisc=1)
         return covariance_along(effects, np.radians(states.sd_attitude_deg))
+
+    def _interpolation_cov(self, trajectory_s: FloatArray, lever: FloatArray) -> FloatArray:
+        """Return the share (n, 3, 3) of what lies between the trajectory's epochs."""
+        errors = interpolation_errors(self.motion, trajectory_s)
+        arm = cross_matrix(lever)
+        return np.asarray(
+            errors.cov_position_m2 + arm @ errors.cov_turn_rad2 @ np.swapaxes(arm, -1, -2)
+        )
 
     def _common_effects(self, frame_from_body: FloatArray, velocity_m_s: FloatArray) -> FloatArray:
         """Return what `TargetPosition.common_m` holds, (n, 3, 4)."""

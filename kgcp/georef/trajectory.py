@@ -123,10 +123,9 @@ class Motion:
         the short intervals into waves over the long ones. Their distances from the spline are
         interpolated along straight lines, so that the path goes through all samples. Attitudes turn
         about a fixed axis between two samples (slerp). Standard deviations are those of the
-        samples, without the errors of interpolation.
+        samples; `interpolation_errors` has what interpolation adds.
         """
-        left = self._left(time_s)
-        fraction = (time_s - self.time_s[left]) / np.diff(self.time_s)[left]
+        left, fraction = self.place(time_s)
         position, velocity = self._positions(time_s, left, fraction)
         attitude, rate = self._attitudes(left, fraction)
         return States(
@@ -138,6 +137,16 @@ class Motion:
             _between(self.sd_attitude_deg, left, fraction),
             _between(self.cov_position_m2, left, fraction),
         )
+
+    def place(self, time_s: FloatArray) -> tuple[IndexArray, FloatArray]:
+        """Return the sample before each time (m,), and the share of the way to the next, 0 … 1."""
+        left = self._left(time_s)
+        return left, (time_s - self.time_s[left]) / np.diff(self.time_s)[left]
+
+    def runs(self) -> list[IndexArray]:
+        """Return the indices of the samples between gaps."""
+        breaks = np.flatnonzero(np.diff(self.time_s) > self.max_gap_s) + 1
+        return np.split(np.arange(len(self.time_s)), breaks)
 
     def _left(self, time_s: FloatArray) -> IndexArray:
         """Return the index of the sample that begins each time's interval."""
@@ -152,13 +161,12 @@ class Motion:
         intervals = np.diff(self.time_s)
         velocity = (np.diff(self.position_m, axis=0) / intervals[:, None])[left]
         position = self.position_m[left] + velocity * (time_s - self.time_s[left])[:, None]
-        breaks = np.flatnonzero(intervals > self.max_gap_s) + 1
-        for run in np.split(np.arange(len(self.time_s)), breaks):
+        for run in self.runs():
             chosen = (left >= run[0]) & (left < run[-1])
             if not chosen.any():
                 continue
             since, samples = self.time_s[run] - self.time_s[run[0]], self.position_m[run]
-            knots = _spread_samples(since)
+            knots = spread_samples(since)
             spline = CubicSpline(since[knots], samples[knots])
             beside = samples - spline(since)  # 0 at the knots
             wanted = time_s[chosen] - self.time_s[run[0]]
@@ -174,7 +182,7 @@ class Motion:
         return attitude.as_matrix(), turn / np.diff(self.time_s)[left, None]
 
 
-def _spread_samples(time_s: FloatArray) -> IndexArray:
+def spread_samples(time_s: FloatArray) -> IndexArray:
     """Return which of n ≥ 2 samples a spline goes through: the ends, and none too close to another.
 
     Beside a long step, the next one may be shorter by `_EVEN_RATIO`. Farther away from it, steps
