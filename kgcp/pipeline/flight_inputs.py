@@ -28,6 +28,7 @@ from kgcp.quality.checks.calibration import check_camera
 from kgcp.quality.checks.camera_position import check_camera_position
 from kgcp.quality.checks.clock import check_completeness, check_exif_times, check_overlap
 from kgcp.quality.checks.course import Course, check_attitude, course_of
+from kgcp.quality.checks.deviations import check_deviations
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild, ranked
 from kgcp.quality.checks.frame_header import FrameHeader, check_frames
 from kgcp.quality.checks.lever_arm import check_lever_arm
@@ -219,6 +220,7 @@ class FlightInputs:
             doubts += check_attitude(self.course)
             if self.target_positions.vehicle is not None:
                 doubts += check_spikes(self.target_positions.vehicle.motion)
+                doubts += check_deviations(self.target_positions.vehicle.motion)
             if self.reference_poses is not None:
                 doubts += check_reference(self.reference_poses, self.target_positions)
         poses = self.reference_poses

@@ -66,6 +66,10 @@ class Cause(StrEnum):
         "trajectory_spike",
         "single epochs of the trajectory lie far from those before and after them",
     )
+    STANDARD_DEVIATIONS = (
+        "standard_deviations",
+        "standard deviations of the trajectory are 0, which nothing measured is",
+    )
     LEVER_ARM = "lever_arm", "an axis of the lever arm has the wrong sign, place or unit"
     MOUNT = "mount_deg", "the plate is mounted in another direction than mount_deg says"
     HEIGHTS = "heights", "heights are of another kind: above the geoid, or above ground"

@@ -1,0 +1,38 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from kgcp.georef.trajectory import Motion
+from kgcp.quality.checks.deviations import check_deviations
+from kgcp.quality.checks.doubt import Cause
+
+_SD = np.full((5, 3), 0.02)
+_MOTION = Motion(np.arange(5.0), np.zeros((5, 3)), np.tile(np.eye(3), (5, 1, 1)), _SD, _SD)
+
+
+def test_deviations_that_are_known_or_missing_raise_no_doubt() -> None:
+    assert not [*check_deviations(_MOTION)]
+    assert not [*check_deviations(replace(_MOTION, sd_position_m=None, sd_attitude_deg=None))]
+    level = _SD * [0.0, 0.0, 1.0]  # a flat yard, and heading by two antennas
+    assert not [*check_deviations(replace(_MOTION, sd_attitude_deg=level))]
+
+
+def test_deviations_of_zero_are_doubted() -> None:
+    position, attitude = check_deviations(
+        replace(_MOTION, sd_position_m=0.0 * _SD, sd_attitude_deg=0.0 * _SD)
+    )
+    assert (position.code, position.is_grave) == (Cause.STANDARD_DEVIATIONS, False)
+    assert "positions are 0 at all epochs" in position.sentence
+    assert "attitudes are 0 at all epochs" in attitude.sentence
+    (heights,) = check_deviations(replace(_MOTION, sd_position_m=_SD * [1.0, 1.0, 0.0]))
+    assert "positions are 0 at all epochs" in heights.sentence
+
+
+def test_epochs_with_deviations_of_zero_are_counted() -> None:
+    sd = _SD.copy()
+    sd[2:4] = 0.0
+    (doubt,) = check_deviations(replace(_MOTION, sd_position_m=sd))
+    assert "are 0 at 2 of 5 epochs" in doubt.sentence
+    assert doubt.figures == {"epochs": 2.0}
