@@ -170,6 +170,8 @@ def _times_text(inputs: FlightInputs) -> str:
     names, times_s = timed_frames(inputs)
     file = inputs.flight.times_file
     source = "EXIF" if file is None else file.name
+    if file is not None and inputs.flight.may_use_exif_times:
+        source += " or EXIF"
     text = f"{len(names)} of {len(inputs.frames)} frames, from {source}"
     return text if not names else f"{text}: {time_span(times_s)} UTC"
 

@@ -129,16 +129,22 @@ class FlightInputs:
     @cached_property
     def times_s(self) -> Mapping[str, float]:
         """Times of frames [s]: those of the detections, of the times file, or of the headers."""
-        flight = self.flight
         if self.detected_s is not None:
             return self.detected_s
-        if flight.times_file is None:
-            return {
-                header.frame: header.time_s for header in self.headers if header.time_s is not None
-            }
+        by_header = {
+            header.frame: header.time_s for header in self.headers if header.time_s is not None
+        }
+        if self.flight.times_file is None:
+            return by_header
         if self._file_times is None:
             return {}
-        frames, times = set(self.frames), self._file_times.time_s
+        return by_header | self._named_s if self.flight.may_use_exif_times else self._named_s
+
+    @property
+    def _named_s(self) -> dict[str, float]:
+        """Times that the times file gives to frames [s]."""
+        frames, named = set(self.frames), self._file_times
+        times = {} if named is None else named.time_s
         return {frame: time_s for frame, time_s in times.items() if frame in frames}
 
     @cached_property
@@ -283,14 +289,21 @@ class FlightInputs:
             yield from check_overlap(frame_s, self.trajectory.time_s, offset_s)
         is_known = self.detected_s is not None or self._file_times is not None
         if self.flight.vehicle is not None and is_known:
-            is_by_header = self.detected_s is None and self.flight.times_file is None
-            frames = [header.frame for header in self.headers] if is_by_header else self.frames
+            may_be_by_header = self.detected_s is None and self.flight.may_use_exif_times
+            read = {header.frame for header in self.headers}
+            frames = [
+                frame
+                for frame in self.frames
+                if frame in read or frame in times or not may_be_by_header
+            ]
             yield from check_completeness(frames, times)
         if self.flight.times_file is not None:
+            # EXIF agrees with itself
+            compared = self._named_s if self.detected_s is None else times
             both = [
-                (times[header.frame], header.time_s)
+                (compared[header.frame], header.time_s)
                 for header in self.headers
-                if header.time_s is not None and header.frame in times
+                if header.time_s is not None and header.frame in compared
             ]
             if both:
                 yield from check_exif_times(*zip(*both, strict=True))
