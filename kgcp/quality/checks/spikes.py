@@ -1,13 +1,15 @@
-"""Single epochs of a trajectory that jump away from the others and back."""
+"""Epochs of a trajectory that jump away from the others and back."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cached_property
 
 import numpy as np
 
-from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.georef.trajectory import Motion
 from kgcp.quality.checks.doubt import Cause, Doubt, mild
 
@@ -16,57 +18,173 @@ _MAX_ACCELERATION_M_S2 = 10.0
 _FAR_SDS = 8.0  # of the three coordinates together
 _FAR = 6.0  # times the usual deviation, where standard deviations are too small or not stated
 _SMOOTH_SHARE = 0.25  # of the jump, which the path may bend by without its epoch
+_RETURN_SHARE = 0.5  # of the jump, by which a run of wrong epochs may miss the path on its return
+_LONGEST_RUN_S = 10.0  # two jumps farther apart may be two other solutions of the ambiguities
+_LONGEST_AT_END = 3  # epochs; more of them may be right, and the others wrong
+_LEAST_EPOCHS = 8  # to say which of two parts is the trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class _Excursion:
+    """Consecutive epochs away from the path of the others."""
+
+    first: int
+    last: int
+    off_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Path:
+    """Some epochs of a trajectory, n ≥ 3."""
+
+    motion: Motion
+    epochs: IndexArray  # (n,): which ones
+
+    @cached_property
+    def time_s(self) -> FloatArray:
+        return np.asarray(self.motion.time_s[self.epochs])
+
+    @cached_property
+    def position_m(self) -> FloatArray:
+        return np.asarray(self.motion.position_m[self.epochs])
+
+    @cached_property
+    def off_m(self) -> FloatArray:
+        """From the line between the epochs before and after to each epoch (n, 3); 0 at the ends."""
+        off_m = np.zeros_like(self.position_m)
+        inner = np.arange(1, len(self.epochs) - 1)
+        off_m[1:-1] = self.off_line_m(inner - 1, inner, inner + 1)
+        return off_m
+
+    @cached_property
+    def is_far(self) -> BoolArray:
+        """Whether epochs (n,) are farther from that line than errors and accelerations allow."""
+        off_m = np.linalg.norm(self.off_m, axis=1)
+        steps_s = np.diff(self.time_s)
+        allowed_m = np.full(len(off_m), np.inf)
+        allowed_m[1:-1] = 0.5 * _MAX_ACCELERATION_M_S2 * steps_s[:-1] * steps_s[1:]
+        if self.motion.sd_position_m is not None:
+            sd_m = np.linalg.norm(self.motion.sd_position_m[self.epochs], axis=1)
+            allowed_m[1:-1] += _FAR_SDS * np.max([sd_m[:-2], sd_m[1:-1], sd_m[2:]], axis=0)
+        usual_m = float(np.median(off_m[1:-1]))
+        return np.asarray(off_m > np.maximum(allowed_m, max(_SMALLEST_M, _FAR * usual_m)))
+
+    @cached_property
+    def jumps(self) -> IndexArray:
+        """The epochs before each step over which the path jumps: both its ends are far off."""
+        is_opposite = np.sum(self.off_m[:-1] * self.off_m[1:], axis=1) < 0.0
+        return np.flatnonzero(self.is_far[:-1] & self.is_far[1:] & is_opposite)
+
+    def off_line_m(self, start: IndexArray, epoch: IndexArray, end: IndexArray) -> FloatArray:
+        """Return how epochs (k,) lie from the motion between two others (k, 3); 0 at these."""
+        time_s, position_m = self.time_s, self.position_m
+        share = (time_s[epoch] - time_s[start]) / (time_s[end] - time_s[start])
+        chord = position_m[end] - position_m[start]
+        return np.asarray(position_m[epoch] - position_m[start] - share[:, None] * chord)
+
+    def beside(self, steps: IndexArray, neighbours: IndexArray) -> FloatArray:
+        """Return what steps (k, 3) are longer than at the velocity of neighbouring steps."""
+        move, steps_s = np.diff(self.position_m, axis=0), np.diff(self.time_s)
+        share = (steps_s[steps] / steps_s[neighbours])[:, None]
+        return np.asarray(move[steps] - share * move[neighbours])
+
+    def without(self, excursions: Sequence[_Excursion]) -> _Path:
+        """Return the path without these epochs."""
+        is_left = np.ones(len(self.motion.time_s), dtype=bool)
+        for each in excursions:
+            is_left[each.first : each.last + 1] = False
+        return _Path(self.motion, self.epochs[is_left[self.epochs]])
 
 
 def check_spikes(motion: Motion) -> Iterator[Doubt]:
-    """Tell single epochs that lie far from the line between the one before and the one after.
+    """Tell epochs that lie far from the path of those before and after.
 
-    A vehicle that brakes or turns leaves that line, too, but without that epoch the others form no
-    smooth path then. The first and the last epoch are not examined.
+    A vehicle that brakes or turns leaves the line between two epochs, too, but without a wrong one
+    the others form a smooth path. Runs of wrong epochs jump away and come back within ten seconds;
+    a jump that stays is another solution of the ambiguities. Of the first and the last three epochs
+    those are named that jump away from all others.
     """
-    epochs = np.arange(len(motion.time_s))
-    middle = epochs[1:-1]
-    if not len(middle):
-        return
-    off_m = _off_chord_m(motion, middle - 1, middle, middle + 1)
-    before_s, after_s = np.diff(motion.time_s)[:-1], np.diff(motion.time_s)[1:]
-    allowed_m = 0.5 * _MAX_ACCELERATION_M_S2 * before_s * after_s
-    if motion.sd_position_m is not None:
-        sd_m = np.linalg.norm(motion.sd_position_m, axis=1)
-        allowed_m += _FAR_SDS * np.max([sd_m[:-2], sd_m[1:-1], sd_m[2:]], axis=0)
-    allowed_m = np.maximum(allowed_m, max(_SMALLEST_M, _FAR * float(np.median(off_m))))
-    chosen = off_m > allowed_m
-    spikes, off_m = middle[chosen], off_m[chosen]
-    left, right = np.maximum(spikes - 2, 0), np.minimum(spikes + 2, epochs[-1])
+    found: list[_Excursion] = []
+    for search in (_single_epochs, _runs, _ends):
+        path = _Path(motion, np.arange(len(motion.time_s))).without(found)
+        if len(path.epochs) < 3:
+            break
+        found += search(path)
+    if found:
+        yield _doubt(found, motion)
+
+
+def _single_epochs(path: _Path) -> Iterator[_Excursion]:
+    spikes = np.flatnonzero(path.is_far)
+    left, right = np.maximum(spikes - 2, 0), np.minimum(spikes + 2, len(path.epochs) - 1)
+    off_m = np.linalg.norm(path.off_m[spikes], axis=1)
     bend_m = np.maximum(
-        _off_chord_m(motion, left, spikes - 1, spikes + 1),
-        _off_chord_m(motion, spikes - 1, spikes + 1, right),
+        np.linalg.norm(path.off_line_m(left, spikes - 1, spikes + 1), axis=1),
+        np.linalg.norm(path.off_line_m(spikes - 1, spikes + 1, right), axis=1),
     )
-    is_spike = bend_m < _SMOOTH_SHARE * off_m
-    spikes, off_m = spikes[is_spike], off_m[is_spike]
-    if not len(spikes):
+    for row in np.flatnonzero(bend_m < _SMOOTH_SHARE * off_m).tolist():
+        epoch = int(path.epochs[spikes[row]])
+        yield _Excursion(epoch, epoch, float(off_m[row]))
+
+
+def _runs(path: _Path) -> Iterator[_Excursion]:
+    """Yield what lies between two consecutive jumps of which the second undoes the first."""
+    away, back = path.jumps[:-1], path.jumps[1:]
+    lasts_s = path.time_s[back] - path.time_s[away + 1]
+    is_run = (back > away + 1) & (lasts_s <= _LONGEST_RUN_S)
+    is_run &= (away > 0) & (back < len(path.epochs) - 2)
+    away, back = away[is_run], back[is_run]
+    there_m, return_m = path.beside(away, away - 1), path.beside(back, back + 1)
+    jumps_m = np.minimum(*(np.linalg.norm(each, axis=1) for each in (there_m, return_m)))
+    missed_m = np.linalg.norm(there_m + return_m, axis=1)
+    for row in np.flatnonzero(missed_m < _RETURN_SHARE * jumps_m).tolist():
+        first, last = path.epochs[away[row] + 1], path.epochs[back[row]]
+        yield _Excursion(int(first), int(last), float(jumps_m[row]))
+
+
+def _ends(path: _Path) -> Iterator[_Excursion]:
+    """Yield the first and the last epochs, if the path jumps behind or before them."""
+    last = len(path.epochs) - 1
+    if last + 1 < _LEAST_EPOCHS:
         return
-    worst = int(np.argmax(off_m))
-    when = datetime.fromtimestamp(float(motion.time_s[spikes[worst]]), UTC)
-    count = len(spikes) - 1
-    others = f", as {count} other{' does' if count == 1 else 's do'} by less" if count else ""
-    yield mild(
+    off_m = np.linalg.norm(path.off_m, axis=1)
+    jumps = set(path.jumps.tolist())
+    if path.is_far[1] and off_m[2] < _SMOOTH_SHARE * off_m[1]:
+        jumps.add(0)
+    if path.is_far[last - 1] and off_m[last - 2] < _SMOOTH_SHARE * off_m[last - 1]:
+        jumps.add(last - 1)
+    begin = [step for step in range(_LONGEST_AT_END) if step in jumps]
+    end = [step for step in range(last - _LONGEST_AT_END, last) if step in jumps]
+    for step in begin[-1:]:
+        (jump_m,) = np.linalg.norm(path.beside(np.array([step]), np.array([step + 1])), axis=1)
+        yield _Excursion(int(path.epochs[0]), int(path.epochs[step]), float(jump_m))
+    for step in end[:1]:
+        (jump_m,) = np.linalg.norm(path.beside(np.array([step]), np.array([step - 1])), axis=1)
+        yield _Excursion(int(path.epochs[step + 1]), int(path.epochs[last]), float(jump_m))
+
+
+def _doubt(found: Sequence[_Excursion], motion: Motion) -> Doubt:
+    worst = max(found, key=lambda each: each.off_m)
+    count = worst.last - worst.first + 1
+    first, last = (_utc(float(motion.time_s[row])) for row in (worst.first, worst.last))
+    it = "it" if count == 1 else "them"
+    which = f"the epoch of {first} UTC lies"
+    if count > 1:
+        which = f"the {count} epochs from {first} to {last} UTC lie"
+    has_before, has_after = worst.first > 0, worst.last < len(motion.time_s) - 1
+    beside = "before and after" if has_before and has_after else "before" if has_before else "after"
+    total = sum(each.last - each.first + 1 for each in found)
+    others = total - count
+    less = f", as {others} other{' does' if others == 1 else 's do'} by less" if others else ""
+    return mild(
         Cause.TRAJECTORY_SPIKE,
-        f"the epoch of {when:%Y-%m-%d %H:%M:%S.%f} UTC lies {off_m[worst]:.1f} m from those before"
-        f" and after it{others}: more than the trajectory's standard deviations and a vehicle's"
-        " acceleration allow",
-        "delete the epoch from the trajectory's file if it is wrong: it displaces points near it",
-        {"jump_m": float(off_m[worst]), "epochs": float(len(spikes))},
+        f"{which} {worst.off_m:.1f} m from those {beside} {it}{less}: more than the"
+        " trajectory's standard deviations and a vehicle's acceleration allow",
+        f"delete {'the epoch' if total == 1 else 'these epochs'} from the trajectory's file if"
+        f" {'it is' if total == 1 else 'they are'} wrong: points near {it} are displaced",
+        {"jump_m": worst.off_m, "epochs": float(total)},
     )
 
 
-def _off_chord_m(
-    motion: Motion, start: IndexArray, epoch: IndexArray, end: IndexArray
-) -> FloatArray:
-    """Return how far epochs (n,) lie from the motion between two others [m]; 0 at these."""
-    time_s, position_m = motion.time_s, motion.position_m
-    share = (time_s[epoch] - time_s[start]) / (time_s[end] - time_s[start])
-    chord = position_m[end] - position_m[start]
-    return np.asarray(
-        np.linalg.norm(position_m[epoch] - position_m[start] - share[:, None] * chord, axis=1)
-    )
+def _utc(unix_s: float) -> str:
+    return f"{datetime.fromtimestamp(unix_s, UTC):%Y-%m-%d %H:%M:%S.%f}"

@@ -47,6 +47,51 @@ def test_all_such_epochs_are_counted() -> None:
     assert "as 2 others do by less" in doubt.sentence
 
 
+@pytest.mark.parametrize("rate_hz", [5.0, 20.0, 100.0])
+@pytest.mark.parametrize("epochs", [2, 3, 20])
+@pytest.mark.parametrize("sd_m", [0.01, None])
+def test_a_run_that_jumps_and_returns_is_named(
+    rate_hz: float, epochs: int, sd_m: float | None
+) -> None:
+    time_s = np.arange(0.0, 60.0, 1.0 / rate_hz)
+    position_m = driven(time_s)
+    row = int(np.searchsorted(time_s, 20.0))
+    position_m[row : row + epochs] += [3.0, -2.0, 4.0]
+    (doubt,) = check_spikes(motion(time_s, position_m, sd_m))
+    assert f"the {epochs} epochs from 2026-06-16 08:15:20.000000 to" in doubt.sentence
+    assert "m from those before and after them:" in doubt.sentence
+    assert doubt.figures["jump_m"] == pytest.approx(np.sqrt(29.0), abs=1.0)
+    assert doubt.figures["epochs"] == float(epochs)
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 20.0, 100.0])
+@pytest.mark.parametrize("epochs", [1, 2, 3])
+@pytest.mark.parametrize("at_end", [False, True])
+def test_wrong_first_and_last_epochs_are_named(
+    rate_hz: float, epochs: int, *, at_end: bool
+) -> None:
+    time_s = np.arange(0.0, 60.0, 1.0 / rate_hz)
+    position_m = driven(time_s)
+    position_m[slice(-epochs, None) if at_end else slice(epochs)] += [0.0, 6.0, 0.0]
+    (doubt,) = check_spikes(motion(time_s, position_m))
+    assert ("from those before" if at_end else "from those after") in doubt.sentence
+    assert "before and after" not in doubt.sentence
+    assert doubt.figures["jump_m"] == pytest.approx(6.0, abs=1.0)
+    assert doubt.figures["epochs"] == float(epochs)
+
+
+def test_single_epochs_and_runs_are_counted_together() -> None:
+    time_s = np.arange(0.0, 60.0, 0.1)
+    position_m = driven(time_s)
+    position_m[[50, 200], 0] += 8.0
+    position_m[300:305, 1] -= 5.0
+    position_m[-2:, 2] += 4.0
+    (doubt,) = check_spikes(motion(time_s, position_m))
+    assert "the epoch of 2026-06-16 08:15:" in doubt.sentence
+    assert "as 8 others do by less" in doubt.sentence
+    assert doubt.figures["epochs"] == 9.0
+
+
 def test_roads_raise_no_doubt() -> None:
     for rate_hz in (1.0, 2.0, 5.0, 20.0, 100.0):
         time_s = np.arange(0.0, 60.0, 1.0 / rate_hz)
@@ -71,4 +116,34 @@ def test_a_jump_that_stays_and_coarse_numbers_raise_no_doubt() -> None:
     position_m = driven(time_s)
     position_m[300:] += np.array([4.0, 0.0, 0.0])  # another solution of the ambiguities
     assert not [*check_spikes(motion(time_s, position_m))]
+    position_m[:20] += np.array([0.0, 3.0, 5.0])  # fixed after two seconds
+    assert not [*check_spikes(motion(time_s, position_m))]
+    position_m[500:] -= np.array([4.0, 0.0, 0.0])  # and the first solution again, 20 s later
+    assert not [*check_spikes(motion(time_s, position_m))]
     assert not [*check_spikes(motion(time_s, np.round(driven(time_s) / 1.1) * 1.1, None))]
+
+
+def test_stops_and_turns_about_raise_no_doubt() -> None:
+    rng = np.random.default_rng(6)
+    for rate_hz in (1.0, 5.0, 20.0):
+        time_s = np.arange(0.0, 120.0, 1.0 / rate_hz)
+        there = np.minimum(time_s, 60.0) - np.maximum(time_s - 60.0, 0.0)  # and back, at once
+        position_m = np.column_stack((4.0 * there, 0.0 * time_s, 0.0 * time_s))
+        noisy = position_m + rng.normal(0.0, 0.02, position_m.shape)
+        assert not [*check_spikes(motion(time_s, noisy))]
+        stands = np.abs(np.mod(time_s, 30.0) - 20.0) < 5.0
+        progress = 5.0 * np.cumsum(~stands) / rate_hz  # from 5 m/s to 0 at once, four times
+        position_m = np.column_stack((progress, 0.0 * time_s, 0.0 * time_s))
+        assert not [*check_spikes(motion(time_s, position_m))]
+
+
+def test_float_solutions_with_their_deviations_raise_no_doubt() -> None:
+    time_s = np.arange(0.0, 120.0, 0.2)
+    position_m = driven(time_s)
+    sd_m = np.full_like(position_m, 0.01)
+    floats = (time_s < 0.5) | ((time_s > 60.0) & (time_s < 66.0))
+    position_m[floats] += [3.0, -2.0, 4.0]
+    assert [*check_spikes(motion(time_s, position_m))]
+    sd_m[floats] = 1.0
+    turns = np.broadcast_to(np.eye(3), (len(time_s), 3, 3)).copy()
+    assert not [*check_spikes(Motion(time_s, position_m, turns, sd_m, None))]
