@@ -33,6 +33,7 @@ from kgcp.measurement.image_model.window import contour_px
 from kgcp.pipeline.execution.signals import defer_interrupts
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.flight_inputs import FlightInputs, naming_causes
+from kgcp.pipeline.frame_priors import motions_while_read
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.advice import advice
 from kgcp.quality.bias_study import BiasStudy, study_bias
@@ -218,13 +219,15 @@ def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBi
     data = FlightData(flight, [attempt.frame for attempt in attempts])
     inputs = FlightInputs.detected(flight, data, attempts)
     with naming_causes(inputs.plausibility):
+        poses, positions = data.reference_poses, data.target_positions
         study = study_bias(
             attempts,
-            data.reference_poses,
-            data.target_positions,
+            poses,
+            positions,
             flight.camera,
             flight.all_targets,
             settings.method,
+            motions_while_read(flight, data, poses, positions.local_frame, attempts),
         )
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
     consistency, doubts = inputs.compared(sightings)

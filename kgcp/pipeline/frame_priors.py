@@ -1,16 +1,25 @@
-"""What a flight's data say about each frame before it is looked at."""
+"""What a flight's data say about each frame: its plate, and how the camera moves meanwhile."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
 import numpy as np
 
 from kgcp.errors import KgcpError
+from kgcp.geometry.attitude import ReferencePoses
 from kgcp.georef.exterior_orientation import ExteriorOrientations
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.plate_priors import CameraAttitudes, normal_priors
-from kgcp.georef.scene_rotation import combine, rotations_between_frames
+from kgcp.georef.scene_rotation import (
+    CameraMotions,
+    camera_motions,
+    combine,
+    rotations_between_frames,
+)
+from kgcp.georef.sighting import Attempt
 from kgcp.georef.target_positions import TargetPosition, Vehicle
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
@@ -146,3 +155,30 @@ def _rotations(
         SceneRotation.unknown(camera),
     )
     return {row: rotation for (_, row, _), rotation in zip(placed, rotations, strict=True)}
+
+
+def motions_while_read(
+    flight: Flight,
+    data: FlightData,
+    poses: ReferencePoses,
+    local_frame: LocalFrame,
+    attempts: Sequence[Attempt],
+) -> CameraMotions | None:
+    """Return how the camera moves while frames with poses are read, in the poses' order.
+
+    None: the frames are exposed at once, or nothing was measured.
+    """
+    distances_m = [attempt.sighting.distance_m for attempt in attempts if attempt.sighting]
+    if not flight.camera.readout_s or not distances_m:
+        return None
+    orientations = ExteriorOrientations.of(poses, local_frame)
+    time_s = {attempt.frame: attempt.time_s for attempt in attempts}
+    times = [time_s.get(frame) for frame in poses.frames]
+    unknown, rates = SceneRotation.unknown(flight.camera), data.scene_rotations
+    return camera_motions(
+        np.array([math.nan if time is None else time for time in times]),
+        orientations.centre_m,
+        orientations.enu_from_camera,
+        [rates.get(frame, unknown) for frame in poses.frames],
+        float(np.median(distances_m)),
+    )

@@ -14,17 +14,29 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.camera import Camera
 from kgcp.georef.exterior_orientation import ExteriorOrientations, visible_pixels
+from kgcp.georef.scene_rotation import CameraMotions
 from kgcp.georef.sighting import Attempt
 from kgcp.georef.target_positions import NoPosition, TargetPosition, TargetPositions
 from kgcp.settings import Method
 from kgcp.targets.plain import AnyTarget
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _CameraPlace:
+    """Where the reference puts a camera when the target is exposed, in the ENU frame."""
+
+    centre_m: FloatArray  # (3,): projection centre [m]
+    enu_from_camera: FloatArray  # (3, 3): camera axes, as columns
+    # (3, 3): covariance of the centre [m²]; None: the poses have no deviations
+    cov_m2: FloatArray | None
+
+
 @dataclass(frozen=True, slots=True)
 class ReferenceSds:
     """Standard deviations of a reference distance, by where they come from."""
 
-    # of the camera's reference position, taken as independent from frame to frame [m]
+    # of the camera's reference position, taken as independent from frame to frame, and of what it
+    # moves until a rolling shutter has read the target [m]
     pose_m: float
     place_m: float  # of the trajectory, attitude included: an error that lasts for a while [m]
     # of lever arm and synchronisation, or of a static target's position [m]: the same in all frames
@@ -37,20 +49,15 @@ class ReferenceSds:
 
     @classmethod
     def along(
-        cls,
-        direction: FloatArray,
-        position: TargetPosition,
-        orientations: ExteriorOrientations,
-        row: int,
+        cls, direction: FloatArray, position: TargetPosition, camera: _CameraPlace
     ) -> Self | None:
         """Return those along a line of sight: a unit vector (3,) in the ENU frame.
 
-        `row` is that of the frame among the reference poses. None where trajectory, static target
-        or poses have no standard deviations.
+        None where trajectory, static target or poses have no standard deviations.
         """
-        if position.cov_m2 is None or orientations.cov_m2 is None:
+        if position.cov_m2 is None or camera.cov_m2 is None:
             return None
-        pose = float(direction @ orientations.cov_m2[row] @ direction)
+        pose = float(direction @ camera.cov_m2 @ direction)
         whole = float(direction @ position.cov_m2 @ direction)
         common = whole  # of a static target
         if position.common_m is not None:
@@ -140,6 +147,7 @@ def study_bias(
     camera: Camera,
     targets: Sequence[AnyTarget],
     method: Method,
+    motions: CameraMotions | None = None,
 ) -> BiasStudy:
     """Compare every attempt with the reference.
 
@@ -147,6 +155,9 @@ def study_bias(
     ----------
     attempts : sequence of Attempt
         One per frame and target; targets never measured are left out.
+    motions : CameraMotions, optional
+        How the camera moves while a rolling shutter reads the frames, in the order of the poses:
+        these are those of the middle row. None: it does not move, or all rows are exposed at once.
 
     Raises
     ------
@@ -169,7 +180,10 @@ def study_bias(
         if isinstance(position, TargetPosition)
     ]
     orientations = ExteriorOrientations.of(poses, target_positions.local_frame)
-    compared = _compare_all(placed, poses.frames, orientations, camera, targets)
+    places = _camera_places(
+        [attempt for attempt, _ in placed], poses, orientations, motions, camera
+    )
+    compared = _compare_all(placed, places, camera, targets)
     measured = tuple(pair for pair in compared if pair.attempt.sighting is not None)
     agree = 2 * sum(pair.is_misplaced for pair in measured) < len(measured)
     return BiasStudy(
@@ -182,32 +196,51 @@ def study_bias(
     )
 
 
+def _camera_places(
+    attempts: Sequence[Attempt],
+    poses: ReferencePoses,
+    orientations: ExteriorOrientations,
+    motions: CameraMotions | None,
+    camera: Camera,
+) -> list[_CameraPlace]:
+    """Return the camera's place when the target of each attempt was exposed."""
+    row_of = {frame: row for row, frame in enumerate(poses.frames)}
+    places = []
+    for attempt in attempts:
+        row = row_of[attempt.frame]
+        centre = orientations.centre_m[row]
+        cov = None if orientations.cov_m2 is None else orientations.cov_m2[row]
+        if motions is not None and attempt.sighting is not None:
+            delay_s = attempt.sighting.rows_since_middle(camera) * camera.readout_s
+            centre = centre + delay_s * motions.velocity_m_s[row]
+            moved_sd_m = delay_s * motions.sd_velocity_m_s[row]
+            cov = None if cov is None else cov + moved_sd_m**2 * np.eye(3)
+        places.append(_CameraPlace(centre, orientations.enu_from_camera[row], cov))
+    return places
+
+
 def _compare_all(
     placed: Sequence[tuple[Attempt, TargetPosition]],
-    frames: Sequence[str],
-    orientations: ExteriorOrientations,
+    places: Sequence[_CameraPlace],
     camera: Camera,
     targets: Sequence[AnyTarget],
 ) -> list[Comparison]:
-    """Compare attempts with the poses of their frames; `frames` names those of the orientations."""
-    row_of = {frame: row for row, frame in enumerate(frames)}
-    rows = [row_of[attempt.frame] for attempt, _ in placed]
+    """Compare attempts with the camera's places in their frames."""
     diameters = {target.name: target.outer_diameter_m for target in targets}
     in_camera = [
-        (position.position_m - orientations.centre_m[row]) @ orientations.enu_from_camera[row]
-        for (_, position), row in zip(placed, rows, strict=True)
+        (position.position_m - place.centre_m) @ place.enu_from_camera
+        for (_, position), place in zip(placed, places, strict=True)
     ]
     pixels = visible_pixels(camera, np.reshape(in_camera, (-1, 3)))
     return [
         _compare(
             attempt,
             position,
-            orientations,
-            row,
+            place,
             pixel,
             0.5 * diameters[attempt.target] * camera.mean_focal_px,
         )
-        for (attempt, position), row, pixel in zip(placed, rows, pixels, strict=True)
+        for (attempt, position), place, pixel in zip(placed, places, pixels, strict=True)
     ]
 
 
@@ -238,19 +271,18 @@ def _no_pose(attempts: Sequence[Attempt], poses: ReferencePoses) -> str:
 def _compare(
     attempt: Attempt,
     position: TargetPosition,
-    orientations: ExteriorOrientations,
-    row: int,
+    camera: _CameraPlace,
     expected_px: FloatArray,
     radius_px_m: float,
 ) -> Comparison:
-    """Compare one attempt with the pose in `row`."""
-    sight = position.position_m - orientations.centre_m[row]
+    """Compare one attempt with the place of the camera."""
+    sight = position.position_m - camera.centre_m
     distance = float(np.linalg.norm(sight))
     return Comparison(
         attempt=attempt,
-        camera_m=orientations.centre_m[row],
+        camera_m=camera.centre_m,
         place_m=position.position_m,
-        sds=ReferenceSds.along(sight / distance, position, orientations, row),
+        sds=ReferenceSds.along(sight / distance, position, camera),
         expected_px=expected_px,
         expected_radius_px=radius_px_m / distance,
     )

@@ -9,9 +9,12 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, ReferencePoses, opk_from_rotation
 from kgcp.geometry.camera import Camera
+from kgcp.georef.exterior_orientation import ExteriorOrientations
+from kgcp.georef.scene_rotation import camera_motions
 from kgcp.georef.sighting import Attempt, Exposure, Sighting
 from kgcp.georef.target_positions import NoPosition, TargetPositions
 from kgcp.georef.trajectory import Trajectory
+from kgcp.measurement.plate_prior import SceneRotation
 from kgcp.quality.bias_study import edge_distances, study_bias
 from kgcp.settings import Method, VehicleSettings
 from kgcp.targets.layout import Ring, Target
@@ -20,6 +23,7 @@ _CAMERA = Camera(width=1600, height=1200, fx=2300.0, fy=2300.0, cx=800.0, cy=600
 _TARGET = Target(Ring("A", 0.9, 0.45, 0.642857143, 0.128571429, (0.0, 43.0, 78.0, 180.0)))
 _NOTHING = Exposure(*[None] * 9)
 _METHOD = Method.MODEL
+_NORTH = np.array([0.0, 5.0, 0.0])  # m/s
 _START = np.array([430606.1, 4583523.0, 120.0])
 
 _TIME_S = np.arange(0.0, 10.01, 0.1)
@@ -228,3 +232,72 @@ def test_without_edge_shift_there_are_no_edge_distances() -> None:
         _attempts(), _nadir_poses(_ABOVE), _TARGET_POSITIONS, _CAMERA, [_TARGET], _METHOD
     )
     assert edge_distances(study.measured[0], _METHOD) is None
+
+
+def test_a_rolling_shutters_camera_flies_on_until_the_target_is_exposed() -> None:
+    """Ahead of the vehicle and behind it in turn, at 5 m/s: distances are those of the row's time.
+
+    The image's up is north, the way of vehicle and camera: targets behind are lower in the image,
+    and exposed later. So all reference distances would be too short, as if the scale were wrong.
+    """
+    camera = replace(_CAMERA, readout_s=0.03)
+    count, above_m = 40, 60.0
+    time_s = 5.0 + 0.1 * np.arange(float(count))
+    whole = replace(_TRAJECTORY, time_s=_TIME_S, position_map=_START + np.outer(_TIME_S, _NORTH))
+    target_positions = TargetPositions.of("EPSG:25831", [_TARGET], whole, VehicleSettings())
+
+    def sight_at(at_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return places of the camera, and from it to the target, in ENU."""
+        places = target_positions.positions(["A"] * len(at_s), at_s.tolist())
+        target = np.array([each.position_m for each in places if not isinstance(each, NoPosition)])
+        ahead_m = 12.0 * np.sin(2.0 * np.pi * at_s / 8.0)
+        centre = target + np.column_stack((0.0 * at_s, ahead_m, np.full_like(at_s, above_m)))
+        return centre, target - centre
+
+    delay_s = np.zeros(count)
+    for _ in range(10):
+        _, sight = sight_at(time_s + delay_s)
+        pixels = camera.project(sight * [1.0, -1.0, -1.0])
+        delay_s = camera.readout_s * camera.rows_since_middle(pixels)
+    attempts = [
+        replace(
+            _attempt(index, float(np.linalg.norm(sight[index])), tuple(pixels[index])),
+            time_s=float(time_s[index]),
+        )
+        for index in range(count)
+    ]
+    attempts = [
+        replace(each, sighting=replace(each.sighting, time_s=each.time_s))
+        for each in attempts
+        if each.sighting is not None
+    ]
+    centre, _ = sight_at(time_s)
+    local_frame = target_positions.local_frame
+    grids = local_frame.grid_rotation(centre)
+    enu_from_photo = np.diag([1.0, -1.0, -1.0]) @ CAMERA_FROM_PHOTO
+    poses = ReferencePoses(
+        tuple(_frame(index) for index in range(count)),
+        local_frame.map_from_enu(centre),
+        opk_from_rotation(np.swapaxes(grids, 1, 2) @ enu_from_photo),
+        np.full((count, 3), 0.01),
+        None,
+    )
+    orientations = ExteriorOrientations.of(poses, local_frame)
+    motions = camera_motions(
+        time_s,
+        orientations.centre_m,
+        orientations.enu_from_camera,
+        [SceneRotation.unknown(camera)] * count,
+        above_m,
+    )
+    still, moving = (
+        study_bias(attempts, poses, target_positions, camera, [_TARGET], _METHOD, told)
+        for told in (None, motions)
+    )
+    before = np.array([pair.residual_m for pair in still.measured])
+    after = np.array([pair.residual_m for pair in moving.measured])
+    assert np.abs(before).max() > 0.01
+    assert np.abs(after[1:-1]).max() < 0.001  # the first and the last have no frame beside them
+    sds = np.array([pair.sds.pose_m for pair in moving.measured if pair.sds is not None])
+    assert np.all(np.abs(after) < 3.0 * sds)
+    assert np.median(sds) < 0.011  # hardly more than the poses' own

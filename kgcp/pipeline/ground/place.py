@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +12,9 @@ import numpy as np
 from kgcp.errors import KgcpError
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.georef.crs import is_geographic
-from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.gcp import Gcp, build_gcps
 from kgcp.georef.local_frame import LocalFrame
-from kgcp.georef.scene_rotation import CameraMotions, camera_motions
+from kgcp.georef.scene_rotation import CameraMotions
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.io.exporters.points import MapPoints
@@ -34,11 +32,11 @@ from kgcp.io.tables.places import (
     residual_rows,
 )
 from kgcp.io.tables.provenance import derived_provenance
-from kgcp.measurement.plate_prior import SceneRotation
 from kgcp.network.ground.target_places import PlacedTarget, Placement, TargetMove, place_targets
 from kgcp.network.ground.target_plane import MOST_EXTRA_PX
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.export import write_formats
+from kgcp.pipeline.frame_priors import motions_while_read
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.place_sentences import (
     diameter_sentence,
@@ -180,8 +178,7 @@ def place_flight(
     poses = _poses(flight, data, options.poses, [attempt.frame for attempt in attempts])
     local_frame = _local_frame(flight, poses)
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
-    time_s = {attempt.frame: attempt.time_s for attempt in attempts}
-    motions = _motions(flight, data, poses, local_frame, time_s, sightings)
+    motions = motions_while_read(flight, data, poses, local_frame, attempts)
     with np.errstate(all="ignore"):  # circles are tried anywhere: what is not finite is no result
         placement = place_targets(
             sightings,
@@ -205,29 +202,6 @@ def place_flight(
     )
     used = _used_sightings(placement, sightings)
     return FlightPlaces(flight, placement, used, local_frame, provenance, motions)
-
-
-def _motions(
-    flight: Flight,
-    data: FlightData,
-    poses: ReferencePoses,
-    local_frame: LocalFrame,
-    time_s: Mapping[str, float | None],
-    sightings: Sequence[Sighting],
-) -> CameraMotions | None:
-    """Return how the camera moves while frames with reference poses are read; None: at once."""
-    if not flight.camera.readout_s or not sightings:
-        return None
-    orientations = ExteriorOrientations.of(poses, local_frame)
-    times = [time_s.get(frame) for frame in poses.frames]
-    unknown, rates = SceneRotation.unknown(flight.camera), data.scene_rotations
-    return camera_motions(
-        np.array([math.nan if time is None else time for time in times]),
-        orientations.centre_m,
-        orientations.enu_from_camera,
-        [rates.get(frame, unknown) for frame in poses.frames],
-        float(np.median([sighting.distance_m for sighting in sightings])),
-    )
 
 
 def _require_fit(placement: Placement, flight: Flight, poses: Path | None) -> None:
