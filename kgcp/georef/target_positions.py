@@ -42,6 +42,9 @@ class TargetPosition:
     # places i and j they make the covariance C_i C_jᵀ. None: the target stands still.
     common_m: FloatArray | None = None
     vehicle_state: VehicleState | None = None  # None: the target stands still
+    # (3, 3): share of `cov_m2` by the interpolation between the trajectory's epochs, which does not
+    # last beyond these [m²]; None as `cov_m2`, or the target stands still
+    interpolation_m2: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,13 +88,16 @@ class Vehicle:
         velocity = states.velocity_m_s + np.cross(states.angular_velocity_rad_s, lever)
         common = self._common_effects(states.frame_from_body, velocity)
         cov: Sequence[FloatArray | None] = [None] * len(time_s)
+        between: Sequence[FloatArray | None] = cov
         if states.sd_position_m is not None:
             own = self._trajectory_cov(states, states.sd_position_m)
             own = own + self._attitude_cov(states, lever)
-            own = own + self._interpolation_cov(trajectory_s, lever)
-            cov = list(own + common @ np.swapaxes(common, 1, 2))
+            between_m2 = self._interpolation_cov(trajectory_s, lever)
+            cov = list(own + between_m2 + common @ np.swapaxes(common, 1, 2))
+            between = list(between_m2)
         vehicle_states = map(VehicleState, velocity, states.frame_from_body)
-        return list(map(TargetPosition, states.position_m + lever, cov, common, vehicle_states))
+        places = states.position_m + lever
+        return list(map(TargetPosition, places, cov, common, vehicle_states, between))
 
     def _trajectory_cov(self, states: States, sd_position_m: FloatArray) -> FloatArray:
         """Return the share (n, 3, 3) of the trajectory point, whose deviations are in map axes."""

@@ -80,6 +80,7 @@ class System:
         white = _white_m2(meetings, orientations, poses, sight)
         shift = sd_time_s * velocity
         white = white + shift[:, :, None] * shift[:, None, :]
+        white = white + np.array([_interpolation_m2(meeting.position) for meeting in meetings])
         common_m = np.array([meeting.sighting.sd_common_distance_m or 0.0 for meeting in meetings])
         unit = sight / np.linalg.norm(sight, axis=1, keepdims=True)
         stated = (
@@ -94,7 +95,13 @@ class System:
 def _fading_m2(position: TargetPosition) -> FloatArray:
     if position.cov_m2 is None or position.common_m is None:
         return _UNSTATED_SD_M**2 * np.eye(3)
-    return position.cov_m2 - position.common_m @ position.common_m.T
+    lasting = position.cov_m2 - position.common_m @ position.common_m.T
+    return np.asarray(lasting - _interpolation_m2(position))
+
+
+def _interpolation_m2(position: TargetPosition) -> FloatArray:
+    between = position.interpolation_m2
+    return np.zeros((3, 3)) if between is None else between
 
 
 def _white_m2(

@@ -9,7 +9,10 @@ from scipy.ndimage import gaussian_filter1d
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.interpolation_error import interpolation_errors
+from kgcp.georef.local_frame import LocalFrame
+from kgcp.georef.target_positions import Vehicle
 from kgcp.georef.trajectory import Motion, body_to_ned
+from kgcp.settings import VehicleSettings
 
 _STEP_S = 0.005
 _LEVER_M = np.array([-0.8, 0.15, -1.95])
@@ -150,3 +153,21 @@ def test_epochs_close_to_others_are_no_measure_of_long_steps() -> None:
     sd_deg = np.degrees(np.sqrt(np.einsum("nii->ni", errors.cov_turn_rad2)))
     assert sd_m.max() < 0.005
     assert sd_deg.max() < 0.04
+
+
+def test_a_target_knows_its_share_of_interpolation() -> None:
+    """At an epoch there is none; between, it is what the covariance has more than at the epochs."""
+    motion, *_ = _drawn(_slalom(), 1.0, 0.01, 0.05)
+    time_s = motion.time_s[10] + np.array([0.0, 0.5])
+    local_frame = LocalFrame.at("EPSG:25832", np.array([690000.0, 5336000.0, 500.0]))
+    vehicle = Vehicle(motion, VehicleSettings((-0.8, 0.15, -1.95)), local_frame)
+    at_epoch, between = vehicle.positions(time_s)
+    assert at_epoch.interpolation_m2 is not None
+    np.testing.assert_allclose(at_epoch.interpolation_m2, 0.0, atol=1e-20)
+    assert between.interpolation_m2 is not None
+    assert between.cov_m2 is not None
+    assert 0.02 < np.sqrt(np.trace(between.interpolation_m2)) < 0.2
+    own = np.sqrt(np.trace(between.cov_m2 - between.interpolation_m2))
+    assert own == pytest.approx(np.sqrt(3.0) * 0.01, rel=0.03)
+    silent = Vehicle(replace(motion, sd_position_m=None), vehicle.settings, local_frame)
+    assert silent.positions(time_s)[1].interpolation_m2 is None
