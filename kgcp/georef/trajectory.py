@@ -149,9 +149,15 @@ class Motion:
         return np.split(np.arange(len(self.time_s)), breaks)
 
     def _left(self, time_s: FloatArray) -> IndexArray:
-        """Return the index of the sample that begins each time's interval."""
+        """Return the index of the sample that begins each time's interval.
+
+        The sample before a gap ends the interval before it: what moved across the gap is not known.
+        """
         after = np.searchsorted(self.time_s, time_s, side="right")
-        return np.clip(after - 1, 0, len(self.time_s) - 2)
+        left = np.clip(after - 1, 0, len(self.time_s) - 2)
+        is_gap = np.diff(self.time_s) > self.max_gap_s
+        ends = (time_s == self.time_s[left]) & is_gap[left] & ~is_gap[left - 1] & (left > 0)
+        return np.asarray(left - ends)
 
     def _positions(
         self, time_s: FloatArray, left: IndexArray, fraction: FloatArray

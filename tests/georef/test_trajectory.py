@@ -139,6 +139,17 @@ def test_a_gap_does_not_bend_the_track_beside_it() -> None:
     np.testing.assert_allclose(states.position_m, _circle(np.array([0.85, 30.05])), atol=1e-4)
 
 
+def test_the_epochs_beside_a_gap_have_the_velocity_of_their_own_side() -> None:
+    time_s = np.concatenate((np.arange(0.0, 1.0, 0.1), np.arange(30.0, 31.0, 0.1)))
+    heading_deg = np.where(time_s < 15.0, 90.0 * time_s, 0.0)
+    motion = Motion(time_s, _circle(time_s), _headings(heading_deg), None, None)
+    states = motion.states(time_s[[0, 9, 10, 19]])
+    np.testing.assert_allclose(states.position_m, _circle(time_s[[0, 9, 10, 19]]), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(states.velocity_m_s, axis=1), 10.0, atol=0.1)
+    turn_deg_s = np.degrees(states.angular_velocity_rad_s[:, 2])
+    np.testing.assert_allclose(turn_deg_s, [90.0, 90.0, 0.0, 0.0], atol=1e-6)
+
+
 def test_a_slow_logger_is_no_gap() -> None:
     time_s = np.arange(0.0, 10.0, 1.0)
     motion = _motion(time_s, _circle(time_s))
