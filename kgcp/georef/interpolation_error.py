@@ -58,7 +58,9 @@ def interpolation_errors(motion: Motion, time_s: FloatArray) -> InterpolationErr
             _ACCELERATION_M_S2,
         )
         errors.cov_turn_rad2[chosen] = sampling.covariances(
-            _turn_misfits(motion.time_s[knots], motion.frame_from_body[knots]),
+            _turn_misfits(
+                motion.time_s[knots], motion.frame_from_body[knots], np.unique(sampling.nearby)
+            ),
             _TURN_NOISE * _total_variance(sd_turn_rad, knots),
             _TURN_ORDER,
             _ANGULAR_ACCELERATION_RAD_S2,
@@ -75,25 +77,32 @@ def _spline_misfits(time_s: FloatArray, position_m: FloatArray) -> FloatArray:
     from scipy.interpolate import CubicSpline  # 0.15 s that few commands need
 
     misfits = np.zeros_like(position_m)
-    last = len(time_s) - 1
-    for start in (0, 1):
-        fitted = np.unique([0, *range(start, last, 2), last])
-        others = np.setdiff1d(np.arange(last), fitted)
-        if others.size:
-            spline = CubicSpline(time_s[fitted], position_m[fitted])
-            misfits[others] = position_m[others] - spline(time_s[others])
+    for start in (1, 2):
+        is_left_out = np.zeros(len(time_s), dtype=bool)
+        is_left_out[start:-1:2] = True
+        if is_left_out.any():
+            spline = CubicSpline(time_s[~is_left_out], position_m[~is_left_out])
+            misfits[is_left_out] = position_m[is_left_out] - spline(time_s[is_left_out])
     return misfits
 
 
-def _turn_misfits(time_s: FloatArray, frame_from_body: FloatArray) -> FloatArray:
-    """Return by how much k samples miss the turn between their neighbours (k, 3); 0 at the ends."""
+def _turn_misfits(
+    time_s: FloatArray, frame_from_body: FloatArray, wanted: IndexArray
+) -> FloatArray:
+    """Return by how much k samples miss the turn between their neighbours (k, 3).
+
+    Of those not wanted, and at the ends, it is 0.
+    """
     misfits = np.zeros((len(time_s), 3))
-    if len(time_s) > 2:
-        samples = Rotation.from_matrix(frame_from_body)
-        share = (time_s[1:-1] - time_s[:-2]) / (time_s[2:] - time_s[:-2])
-        turn = (samples[2:] * samples[:-2].inv()).as_rotvec()
-        between = Rotation.from_rotvec(share[:, None] * turn) * samples[:-2]
-        misfits[1:-1] = (samples[1:-1] * between.inv()).as_rotvec()
+    rows = wanted[(wanted > 0) & (wanted < len(time_s) - 1)]
+    if rows.size:
+        before, here, after = (
+            Rotation.from_matrix(frame_from_body[rows + step]) for step in (-1, 0, 1)
+        )
+        share = (time_s[rows] - time_s[rows - 1]) / (time_s[rows + 1] - time_s[rows - 1])
+        turn = (after * before.inv()).as_rotvec()
+        between = Rotation.from_rotvec(share[:, None] * turn) * before
+        misfits[rows] = (here * between.inv()).as_rotvec()
     return misfits
 
 
