@@ -184,6 +184,10 @@ def _remedy_for(cells: Sequence[str], header: Sequence[str]) -> str:
 
 def _check_header(header: Sequence[str], wanted: Sequence[str], where: str) -> None:
     lacking = [name for name in wanted if name not in header]
+    if lacking and header[0].startswith("#"):
+        raise KgcpError(
+            f"{where}: begins with '#'; delete comments, and a '#' before the names of the columns"
+        )
     separator = foreign_separator(header[0], wanted) if lacking and len(header) == 1 else None
     if separator is not None:
         raise KgcpError(f"{where}: its cells are separated by {separator}; {SEPARATOR_REMEDY}")

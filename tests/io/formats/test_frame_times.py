@@ -184,6 +184,11 @@ def test_a_table_has_both_notations_and_may_have_more_columns(tmp_path: Path) ->
     [
         ("", "frames.csv: is empty; its first line must name frame, time"),
         ("frame;time\na.jpg;1\n", "line 1: its cells are separated by ';'; save it with commas"),
+        (
+            "# by a logger, in time\nframe,time\na.jpg,1\n",
+            "line 1: begins with '#'; delete comments",
+        ),
+        ("#frame,time\na.jpg,1\n", "line 1: begins with '#'; delete comments, and a '#'"),
         ("frame,when\na.jpg,1\n", "line 1: lacks the columns time"),
         ("frame,time\na.jpg,1\na.jpg,2\n", r"line 3: frame 'a.jpg' stands in line 2 too"),
         ("frame,time\na.jpg\n", "line 2: has 1 cells, the first line has 2"),
