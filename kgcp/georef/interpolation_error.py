@@ -17,13 +17,12 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.georef.trajectory import Motion, spread_samples
 
 _SPLINE_ORDER, _TURN_ORDER = 4, 2
-_MARGIN = (
-    4.0 / 3.0
-)  # on driven paths at 1 Hz the orders are not reached: 9 … 15 times instead of 16
+# On driven paths at 1 Hz the orders are not reached: errors are 9 … 15 times smaller instead of 16.
+_MARGIN = 4.0 / 3.0
 _NEARBY = np.arange(-1, 3)  # inner epochs about an interval, of which one may fit by chance
-# variance of what is compared, for epochs with independent errors of variance 1
+# Variance of what is compared, for epochs with independent errors of variance 1.
 _SPLINE_NOISE, _TURN_NOISE = 1.7, 1.5
-# of a car, where only two epochs follow each other and nothing can be compared
+# Of a car, where only two epochs follow each other and nothing can be compared.
 _ACCELERATION_M_S2, _ANGULAR_ACCELERATION_RAD_S2 = 1.0, 0.1
 
 
