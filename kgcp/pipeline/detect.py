@@ -336,10 +336,11 @@ def _marks(
     marks = read_marks(places, set(frames), static, flight.camera)
     for frame, in_frame in marks.items():
         by_target = {mark.target: mark.place for mark in in_frame}
-        pair = exchanged_marks(by_target, data.static_positions.static, flight.camera)
-        if pair is not None:
+        names = exchanged_marks(by_target, data.static_positions.static, flight.camera)
+        if names is not None:
+            *others, last = map(repr, names)
             raise KgcpError(
-                f"{places}: the marks of {pair[0]!r} and {pair[1]!r} in {frame} seem to be"
+                f"{places}: the marks of {', '.join(others)} and {last} in {frame} seem to be"
                 " exchanged; exchange their names, or look at their position_m",
                 option="places",
             )

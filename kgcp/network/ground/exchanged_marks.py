@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from itertools import combinations
+from itertools import permutations, product
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from kgcp.geometry.camera import Camera
 from kgcp.georef.plain_prediction import MarkedPlace
@@ -17,6 +18,7 @@ from kgcp.network.ground.pose_adjustment import adjusted_pose
 from kgcp.network.ground.pose_hypotheses import three_point_poses
 
 _MOST_TRIPLES = 6  # that poses start from: one with right names is enough
+_NAMED_TRIPLES = 3  # of these, that get any names: one that is not nearly in a line is enough
 _START_SHARE = 0.1  # of the frame's width, that marks may be off a pose from three of them
 _LIKELY_CHI2 = 25.0  # of a mark, in the mean, at most
 _DOWN_SD_DEG = 10.0  # how far the axis of a camera that looks down is off the vertical
@@ -25,10 +27,10 @@ _SIGMAS = 4.0  # that one of three marks may be displaced by
 
 def exchanged_marks(
     places: Mapping[str, MarkedPlace], positions: Mapping[str, TargetPosition], camera: Camera
-) -> tuple[str, str] | None:
-    """Return two targets whose marks are each other's, as those of all targets of a frame say it.
+) -> tuple[str, ...] | None:
+    """Return the targets whose marks carry each other's names, as all marks of a frame say it.
 
-    No camera above the targets can see them as they are marked, and one can with two names
+    No camera above the targets can see them as they are marked, and one can with these names
     exchanged. Three marks at least tell: exchanged names turn the sense in which they follow each
     other. Three that are nearly in a line do not.
 
@@ -43,18 +45,35 @@ def exchanged_marks(
     images = _point_images(places, positions, camera)
     if any(next(_misfits(camera, each), None) is not None for each in _displaced(images)):
         return None
-    misfits = {}
-    for pair in combinations(range(len(names)), 2):
-        order = np.arange(len(names))
-        order[list(pair)] = pair[::-1]
+    best, least = None, math.inf
+    for order in _orders(camera, images):
         pixels = images.pixels[order]
         readout = Readout.of(camera, pixels)
         exchanged = replace(
             images, pixels=pixels, pixel_cov=images.pixel_cov[order], readout=readout
         )
-        misfits[pair] = min(_misfits(camera, exchanged), default=math.inf)
-    first, second = min(misfits, key=lambda pair: misfits[pair])
-    return (names[first], names[second]) if math.isfinite(misfits[first, second]) else None
+        misfit = min(_misfits(camera, exchanged), default=math.inf)
+        if misfit < least:
+            best, least = order, misfit
+    if best is None:
+        return None
+    return tuple(name for at, name in enumerate(names) if best[at] != at)
+
+
+def _orders(camera: Camera, images: PointImages) -> list[list[int]]:
+    """Return which mark each target may be, where three marks with any names put the camera."""
+    rays, count = camera.undistort(images.pixels), len(images)
+    orders = set()
+    for triple, named in product(_triples(count)[:_NAMED_TRIPLES], permutations(range(count), 3)):
+        for pose in three_point_poses(images.positions_m[list(named)], rays[triple]):
+            points_m = pose.in_camera(images.positions_m)
+            if np.any(points_m[:, 2] <= 0.0):
+                continue
+            off_px = np.abs(camera.project(points_m)[:, None] - images.pixels).max(axis=2)
+            targets, marks = linear_sum_assignment(off_px)
+            if off_px[targets, marks].max() < _START_SHARE * camera.width:
+                orders.add(tuple(marks.tolist()))
+    return [[*order] for order in sorted(orders)]
 
 
 def _point_images(
@@ -106,8 +125,7 @@ def _misfits(camera: Camera, images: PointImages) -> Iterator[float]:
 def _starts(camera: Camera, images: PointImages) -> Iterator[CameraPose]:
     """Yield poses of three marks that the others roughly agree with."""
     rays, count = camera.undistort(images.pixels), len(images)
-    for first in range(1 if count == 3 else min(count, _MOST_TRIPLES)):
-        triple = [(first + each) % count for each in range(3)]
+    for triple in _triples(count):
         for pose in three_point_poses(images.positions_m[triple], rays[triple]):
             points_m = pose.in_camera(images.positions_m)
             if np.any(points_m[:, 2] <= 0.0):
@@ -115,3 +133,9 @@ def _starts(camera: Camera, images: PointImages) -> Iterator[CameraPose]:
             off_px = camera.project(points_m) - images.pixels
             if np.max(np.abs(off_px)) < _START_SHARE * camera.width:
                 yield pose
+
+
+def _triples(count: int) -> list[list[int]]:
+    """Return threes of marks that follow each other."""
+    firsts = range(1 if count == 3 else min(count, _MOST_TRIPLES))
+    return [[(first + each) % count for each in range(3)] for first in firsts]
