@@ -14,6 +14,7 @@ from kgcp.io.files.safe_read import is_file
 
 _TEXTS, _NUMBERS, _SD = ("frame", "target"), ("x_px", "y_px"), "sd_px"
 _USUAL_SD_PX = 2.0  # of what is marked by hand
+_LEAST_SD_PX = 0.001  # whose square, and what is divided by it, are ordinary numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +39,8 @@ def read_marks(
     ------
     KgcpError
         Naming the line: the file is missing, or a cell is wrong, names no frame or target of this
-        flight, marks a target twice in a frame or beyond its border; or a frame has fewer than two
-        marks, whose distance tells its scale, or two at one place.
+        flight, marks a target twice in a frame or beyond its border; nothing is marked; or a frame
+        has fewer than two marks, whose distance tells its scale, or two at one place.
     """
     if not is_file(path):
         raise KgcpError(f"{path}: does not exist; name a file of marked places", option="places")
@@ -58,11 +59,20 @@ def read_marks(
             raise KgcpError(f"{where}: {target!r} is not a static target; name one of {listed}")
         if not (0.0 <= x_px <= camera.width - 1.0 and 0.0 <= y_px <= camera.height - 1.0):
             raise KgcpError(f"{where}: ({x_px:g}, {y_px:g}) is outside the frame; correct it")
-        if not sd_px > 0.0:
-            raise KgcpError(f"{where}: sd_px is {sd_px:g}; give a standard deviation above 0")
+        if sd_px < _LEAST_SD_PX:
+            problem = f"sd_px is {sd_px:g}; give a standard deviation of {_LEAST_SD_PX:g} or more"
+            raise KgcpError(f"{where}: {problem}")
         if target in marks.setdefault(frame, {}):
             raise KgcpError(f"{where}: {target!r} is marked twice in {frame}; keep one of them")
         marks[frame][target] = HandMark(target, MarkedPlace(x_px, y_px, sd_px))
+    _require_scale(path, marks)
+    return {frame: tuple(named.values()) for frame, named in marks.items()}
+
+
+def _require_scale(path: Path, marks: Mapping[str, Mapping[str, HandMark]]) -> None:
+    """Refuse frames whose marks do not tell their scale."""
+    if not marks:
+        raise KgcpError(f"{path}: marks no target; mark two static targets or more in a frame")
     for frame, named in marks.items():
         apart = {(mark.place.x_px, mark.place.y_px) for mark in named.values()}
         if len(apart) < max(2, len(named)):
@@ -70,4 +80,3 @@ def read_marks(
             raise KgcpError(
                 f"{path}: {frame} {problem}; mark two static targets or more in a frame"
             )
-    return {frame: tuple(named.values()) for frame, named in marks.items()}
