@@ -219,7 +219,7 @@ def _orient_by_device(
     device, the_flight = read_device(device_file), read_flight(flight)
     made = orient_frames_by_device(the_flight, device, patterns, has_free_focal=free_focal)
     path = write_device_poses(made, out or results_folder(flight))
-    _report_frames({"device": device.name}, made, path, as_json=as_json)
+    _report_frames({"device": device.name}, (), made, path, as_json=as_json)
 
 
 def _orient_by_field(
@@ -233,17 +233,23 @@ def _orient_by_field(
 ) -> None:
     from kgcp.io.flight.field_file import read_field
     from kgcp.io.flight.flight import read_flight
-    from kgcp.pipeline.ground.field import orient_frames_by_field, write_field_poses
+    from kgcp.pipeline.ground.field import (
+        field_doubts,
+        orient_frames_by_field,
+        write_field_poses,
+    )
     from kgcp.pipeline.workspace import results_folder
 
     field, the_flight = read_field(*field_and_unit), read_flight(flight)
     made = orient_frames_by_field(the_flight, field, patterns, has_free_focal=free_focal)
     path = write_field_poses(made, out or results_folder(flight))
-    _report_frames({"field": field.name}, made, path, as_json=as_json)
+    doubts = field_doubts(made, field)
+    _report_frames({"field": field.name}, doubts, made, path, as_json=as_json)
 
 
 def _report_frames(
     about: Mapping[str, str],
+    doubts: Sequence[str],
     frames: Sequence[OrientedFrame[PoseT]],
     path: Path,
     *,
@@ -255,8 +261,11 @@ def _report_frames(
         oriented = sum(each.pose is not None for each in frames)
         reasons = {each.frame: each.reason for each in frames if each.pose is None}
         counts = {"frames": len(frames), "oriented": oriented, "not_oriented": reasons}
-        click.echo(json.dumps({**about, **counts, "files": [str(path)]}))
+        files = {"doubts": doubts, "files": [str(path)]}
+        click.echo(json.dumps({**about, **counts, **files}))
     for each in frames:
         outcome = f"not oriented: {each.reason}" if each.pose is None else each.pose.in_words
         click.echo(f"{each.frame}: {outcome}", err=True)
+    for doubt in doubts:
+        click.echo(f"kgcp: look: {doubt}", err=True)
     click.echo(f"wrote {path}", err=True)

@@ -452,6 +452,31 @@ def test_a_field_orients_frames_in_its_own_frame(tmp_path: Path) -> None:
     assert "no frame can be oriented by the field 'board': fewer than six discs" in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("stated", "words"),
+    [
+        ("pitch_m = 0.03", ""),
+        ("pitch_m = 30.0", "the discs are 1e+03 times as large as the field says"),
+        ("pitch_m = 0.027", "the discs are 0.9 times as large as the field says"),
+    ],
+)
+def test_a_field_whose_discs_have_another_size_is_told(
+    tmp_path: Path, stated: str, words: str
+) -> None:
+    """Its distances are in millimetres, or wrong, and so are the poses."""
+    folder = tmp_path / "flight"
+    field_flight(folder)
+    toml = folder / "field.toml"
+    text = toml.read_text(encoding="utf-8")
+    assert "pitch_m = 0.03" in text
+    toml.write_text(text.replace("pitch_m = 0.03", stated), encoding="utf-8")
+    result = run("orient", folder, "--field", toml, "--json")
+    assert result.exit_code == 0, result.stderr
+    doubts = json.loads(result.stdout)["doubts"]
+    assert len(doubts) == result.stderr.count("kgcp: look: ") == bool(words)
+    assert words in result.stderr
+
+
 def test_a_field_without_a_mark_does_not_tell_how_it_lies(tmp_path: Path) -> None:
     folder = tmp_path / "flight"
     field_flight(folder)

@@ -9,7 +9,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Camera
-from kgcp.geometry.circle_image import Circles3D, eccentricity, plane_axes
+from kgcp.geometry.circle_image import Circles3D, circle_images, eccentricity, plane_axes
 from kgcp.network.ground.frame_poses import FOCAL_DETERMINED, FOCAL_SCALES, SD_FOCAL
 from kgcp.network.ground.point_images import CameraPose, PointImages, Readout
 from kgcp.network.ground.resection import NoPoseError, Resection, orient
@@ -35,6 +35,8 @@ class FieldPose:
         Discs of the field that were measured, and those that agree.
     rms_px : float
         Of the residuals of these, per coordinate.
+    radius_scale : float
+        Radii of the discs in the image, over those that the field's diameters have in this pose.
     """
 
     pose: CameraPose
@@ -42,6 +44,7 @@ class FieldPose:
     discs: int
     discs_used: int
     rms_px: float
+    radius_scale: float
 
     @property
     def in_words(self) -> str:
@@ -91,8 +94,9 @@ def orient_by_field(
     for _ in range(_ROUNDS):
         pose = found.pose
         circles = Circles3D(pose.in_camera(positions_m), pose.world_from_camera.T @ axes, radii_m)
-        # it grows with the focal length
+        # both grow with the focal length
         off_px = pose.focal_scale * eccentricity(camera, circles).total_px
+        sizes_px = pose.focal_scale * _sizes_px(circle_images(camera, circles).moments)
         before_px, beyond_px = beyond_px, _beyond_noise_px(camera, images, found)
         images = replace(images, pixels=places - off_px)
         found = _oriented(camera, images, beyond_px, has_free_focal=has_free_focal)
@@ -103,7 +107,14 @@ def orient_by_field(
         raise NoPoseError(f"the focal length is not determined (± {sd:.0f} %)")
     rms_px = float(np.sqrt(np.mean(found.residuals[found.is_used, :2] ** 2)))
     used = int(np.count_nonzero(found.is_used))
-    return FieldPose(found.pose, found.cov, len(point), used, rms_px)
+    radius_scale = float(np.median((_sizes_px(moments) / sizes_px)[found.is_used]))
+    return FieldPose(found.pose, found.cov, len(point), used, rms_px, radius_scale)
+
+
+def _sizes_px(moments: FloatArray) -> FloatArray:
+    """Return radii (n,) of circles as large as areas with these moments (n, 5)."""
+    xx, xy, yy = moments[:, 2:].T
+    return np.asarray(2.0 * (xx * yy - xy**2) ** 0.25)
 
 
 def _first(camera: Camera, images: PointImages, *, has_free_focal: bool) -> Resection:

@@ -27,6 +27,8 @@ from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.ground.own_frame import OrientedFrame, require_a_pose, write_own_frame_poses
 from kgcp.targets.fields.points import AnyField
 
+_RADIUS_SHARE = 0.03  # of the radii: prints and edges are better
+
 
 @single_threaded()
 def orient_frames_by_field(
@@ -91,6 +93,22 @@ def _oriented(
     except NoPoseError as error:
         return OrientedFrame(frame, None, str(error))
     return OrientedFrame(frame, pose, "")
+
+
+def field_doubts(frames: Sequence[OrientedFrame[FieldPose]], field: AnyField) -> tuple[str, ...]:
+    """Return what to look at before the poses are used: they are as far away as the field is large.
+
+    The sizes of the discs tell if the field's distances, or its diameters, have another unit.
+    """
+    scales = [each.pose.radius_scale for each in frames if each.pose is not None]
+    scale = float(np.median(scales))
+    if not field.is_diameter_stated or abs(scale - 1.0) <= _RADIUS_SHARE:
+        return ()
+    doubt = (
+        f"the discs are {scale:.3g} times as large as the field says; look at its distances, which"
+        " the poses' places follow, and its diameters"
+    )
+    return (doubt,)
 
 
 def write_field_poses(frames: Sequence[OrientedFrame[FieldPose]], folder: Path) -> Path:
