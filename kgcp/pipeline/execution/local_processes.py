@@ -20,6 +20,7 @@ import threading
 import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from multiprocessing import forkserver
 from multiprocessing.connection import wait
@@ -212,13 +213,17 @@ def _serve(connection: _Connection) -> None:
     """Make calls until the parent closes the pipe, or ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    connection.send(None)
+    # a parent that is killed may leave results unread, which resets the pipe
+    with suppress(EOFError, ConnectionError):
+        connection.send(None)
+        _answer(connection)
+
+
+def _answer(connection: _Connection) -> None:
+    """Make the calls that come, and send what they return or raise."""
     function: Any = None  # of the calls, until another one comes
     while True:
-        try:
-            data = connection.recv_bytes()
-        except EOFError:
-            return
+        data = connection.recv_bytes()
         result, error = None, None
         try:
             is_function, sent = pickle.loads(data)  # noqa: S301 - the parent's own

@@ -22,6 +22,7 @@ from kgcp.pipeline.execution.local_processes import (
     Preparation,
     SupervisedProcessPool,
     WorkerProcess,
+    _serve,
 )
 from kgcp.pipeline.execution.resilient_map import (
     SerialExecutor,
@@ -292,3 +293,19 @@ def test_no_worker_outlives_a_parent_that_is_killed(tmp_path: Path) -> None:
 
 def test_there_is_a_core_to_use() -> None:
     assert 1 <= usable_cores() <= (os.cpu_count() or 1)
+
+
+@pytest.mark.parametrize("error", [EOFError, ConnectionResetError, BrokenPipeError])
+def test_a_worker_whose_parent_is_gone_ends_without_a_traceback(
+    monkeypatch: pytest.MonkeyPatch, error: type[Exception]
+) -> None:
+    """A parent that is killed with results unread resets the pipe."""
+
+    class Gone:
+        def send(self, _: object) -> None: ...
+
+        def recv_bytes(self) -> bytes:
+            raise error
+
+    monkeypatch.setattr(signal, "signal", lambda *_: None)  # this process can be interrupted
+    _serve(Gone())
