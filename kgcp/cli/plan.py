@@ -155,7 +155,10 @@ def _table(target: AnyTarget, conditions: Conditions, outlooks: Sequence[Outlook
     from kgcp.targets.plain import PlainTarget
 
     plain = target if isinstance(target, PlainTarget) else None
-    least_px = SURE_PX if plain is None else least_plain_px(plain)
+    if plain is None:
+        least_px, sharp_px = SURE_PX, conditions.least_ring_px
+    else:
+        least_px, sharp_px = least_plain_px(plain), conditions.least_disc_px
     yield f"Target {target.name}"
     yield from _aligned(_COLUMNS, map(_cells, outlooks))
     blur = f"{conditions.blur_px:g} px"
@@ -165,8 +168,10 @@ def _table(target: AnyTarget, conditions: Conditions, outlooks: Sequence[Outlook
     yield f"speed: over ground, the largest that blurs by {blur} in {conditions.exposure_s:g} s."
     yield (
         f"diameter: the smallest for a σ of {conditions.accuracy_percent:g} % of the distance"
-        f" and a radius of {least_px:.3g} px."
+        f" and a radius of {max(least_px, sharp_px):.3g} px."
     )
+    if sharp_px > least_px:
+        yield f"found: none below {sharp_px:.3g} px, where so much blur leaves too little."
     if plain is not None:
         yield "found: where the frame's pose puts it, on even ground in contrast to it."
     yield ""
