@@ -183,6 +183,8 @@ def command(
         return
     if unit is not None:
         raise click.UsageError("--unit applies to --field only; leave it out")
+    if "motion" in given and not settings.camera.readout_s:
+        raise click.UsageError("--motion acts while rows are exposed; give --rolling, too")
     if frames is not None:
         settings = replace(settings, frames=frames)
     if not survey_errors:

@@ -26,7 +26,7 @@ class ImageMotion:
 
     def __post_init__(self) -> None:
         for value in self.mean_px_s:
-            require_range("mean_px_s", value, -1e5, 1e5, unit="px/s")
+            require_range("motion", value, -1e5, 1e5, unit="px/s")
         require_range("sd_px_s", self.sd_px_s, 0.0, 1e5, unit="px/s")
 
     def drawn(self, camera: Camera, still_row: float, rng: np.random.Generator) -> RowMotion:

@@ -177,6 +177,23 @@ def test_lists_of_points_take_a_unit(tmp_path: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("options", "words", "code"),
     [
+        ("--motion 30 -40", "--motion acts while rows are exposed; give --rolling, too", 2),
+        ("--preset rolling --rolling 0 --motion 30 -40", "give --rolling, too", 2),
+        ("--rolling 0.02 --motion nan 1", "--motion: nan px/s is out of range", 1),
+    ],
+)
+def test_motion_that_cannot_be_is_refused(
+    tmp_path: Path, options: str, words: str, code: int
+) -> None:
+    result = CliRunner().invoke(main, ["simulate", str(tmp_path / "a"), *options.split()])
+    assert result.exit_code == code
+    assert words in result.stderr
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words", "code"),
+    [
         (["--no-survey-errors"], "--no-survey-errors concerns flights; leave it out", 2),
         (["--shadow", "0.5"], "simulated without shadows", 1),
         (["--rolling", "0.02"], "simulated without a rolling shutter", 1),
