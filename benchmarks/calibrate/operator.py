@@ -33,6 +33,10 @@ from kgcp.simulation.point_spread import Aberration
 _FOCAL_PX = 200_000.0  # so long that images are affine
 _COLUMNS, _ROWS = 5, 4  # of a photograph
 _GAP_PX = 14.0
+_SHIFT_PX = 0.5  # of each disc from its place among the others, at most
+# In JPEGs: all places in a block are alike. Discs of R 5 px, of which each was three blocks from
+# the next one, were compressed alike, and a curve was learned from that.
+_SHIFT_IN_BLOCKS_PX, _GAP_BETWEEN_BLOCKS_PX = 4.0, 21.0
 _BRIGHT, _DARK = 0.62, 0.10
 _GRADIENT = 0.05  # of the light over one radius, at most over …
 _LARGEST_FALL = 0.3  # … the photograph's half width
@@ -56,6 +60,15 @@ class Case:
     defocus_px: float = 0.0  # radius of the disc that a point becomes
 
     @property
+    def shift_px(self) -> float:
+        """By how much discs are shifted from a regular grid, at most."""
+        return _SHIFT_IN_BLOCKS_PX if self.quality else _SHIFT_PX
+
+    def pitch_px(self, radius_px: float) -> float:
+        """Return how far discs of a radius are from each other."""
+        return 2.0 * radius_px + (_GAP_BETWEEN_BLOCKS_PX if self.quality else _GAP_PX)
+
+    @property
     def optics(self) -> Optics:
         """The lens."""
         return Optics(_PSF_PX, aberration=Aberration(defocus_px=self.defocus_px))
@@ -73,6 +86,7 @@ CASES = {
     "unknown_clipped": Case(ToneCurve.LINEAR, Response.UNKNOWN, 1.6, gain=1.5 / _BRIGHT),
     "unknown_clipped_film": Case(ToneCurve.FILM, Response.UNKNOWN, 1.6, gain=1.5 / _BRIGHT),
     "unknown_linear_jpeg": Case(ToneCurve.LINEAR, Response.UNKNOWN, 2.5, quality=92),
+    "unknown_srgb_jpeg": Case(ToneCurve.SRGB, Response.UNKNOWN, 2.5, quality=92),
     "clipped_jpeg": Case(ToneCurve.LINEAR, Response.LINEAR, 2.5, gain=1.5 / _BRIGHT, quality=92),
     "unknown_clipped_jpeg": Case(
         ToneCurve.FILM, Response.UNKNOWN, 2.5, gain=1.5 / _BRIGHT, quality=92
@@ -184,7 +198,7 @@ def measure(setup: Setup) -> Outcome:
     cv2.setNumThreads(1)
     case, radius = CASES[setup.case], setup.radius_px
     rng = np.random.default_rng([setup.seed, int(10 * radius), len(setup.case)])
-    pitch = 2.0 * radius + _GAP_PX
+    pitch = case.pitch_px(radius)
     width, height = int((_COLUMNS + 0.3) * pitch), int((_ROWS + 0.3) * pitch)
     camera = Camera(width, height, _FOCAL_PX, _FOCAL_PX, 0.5 * (width - 1), 0.5 * (height - 1))
     sensor = Sensor(tone=case.tone, sharpening=case.sharpening)
@@ -249,10 +263,10 @@ def pooled(outcomes: Sequence[Outcome]) -> Outcome:
 
 
 def _scene(setup: Setup, pitch_px: float, fall: float, rng: np.random.Generator) -> FieldScene:
-    discs = []
+    discs, shift_px = [], CASES[setup.case].shift_px
     for row, column in itertools.product(range(_ROWS), range(_COLUMNS)):
         place = np.array([column - 0.5 * (_COLUMNS - 1), row - 0.5 * (_ROWS - 1)]) * pitch_px
-        x, y = ((place + rng.uniform(-0.5, 0.5, 2)) / _FOCAL_PX).tolist()
+        x, y = ((place + rng.uniform(-shift_px, shift_px, 2)) / _FOCAL_PX).tolist()
         normal = _normal(setup.ratio, rng.uniform(0.0, 2.0 * math.pi))
         discs.append(SimulatedDisc((x, y, 0.0), 2.0 * setup.radius_px / _FOCAL_PX, 0.0, normal))
     turn = rng.uniform(0.0, 2.0 * math.pi)
@@ -299,7 +313,7 @@ def _bound_by_light(setup: Setup, sensor: Sensor, fall: float) -> Callable[[floa
     camera = Camera(side, side, _FOCAL_PX, _FOCAL_PX, 0.5 * (side - 1), 0.5 * (side - 1))
     place = (0.31 / _FOCAL_PX, 0.17 / _FOCAL_PX, 0.0)
     disc = SimulatedDisc(place, 2.0 * radius / _FOCAL_PX, 0.0, _normal(setup.ratio, 0.6))
-    farthest_px = 0.5 * math.hypot(_COLUMNS, _ROWS) * (2.0 * radius + _GAP_PX)
+    farthest_px = 0.5 * math.hypot(_COLUMNS, _ROWS) * case.pitch_px(radius)
     lights = np.linspace(1.0 - fall * farthest_px, 1.0 + fall * farthest_px, _BOUND_LIGHTS)
     bounds_px2 = []
     for light in lights.tolist():

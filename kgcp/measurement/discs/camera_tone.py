@@ -488,11 +488,16 @@ def _with_waves(state: DiscState, tone: Tone, waves: FloatArray) -> DiscState:
 
 
 def _is_bent(joint: JointFit) -> bool:
-    """Return whether a curve is more bent than one that hardly is, and than the model may lack."""
+    """Return whether a curve is more bent than one that hardly is, and than the model may lack.
+
+    Of film's curve in JPEGs of quality 92, the excess is 1.6 to 2.1. By its third power as above, a
+    quarter of the photographs of dark discs of R 5 px seemed to be sRGB's: centres were off by
+    0.012 px where light falls off by 5 % over the radius, with its square by 0.007 px.
+    """
     waves, excess = joint.shared[:WAVES], _excess(joint)
     cov = excess * np.linalg.inv(joint.precision)[:WAVES, :WAVES] + _LITTLE_BENT**2 * np.eye(WAVES)
     square = excess * float(waves @ np.linalg.solve(cov, waves))
-    return square > _WORTHY_BENDS * excess**_BY_EXCESS
+    return square > _WORTHY_BENDS * excess * excess
 
 
 def _state_by(fit: DiscFit, tone: Tone, sharpening: float) -> DiscState:
