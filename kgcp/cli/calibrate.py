@@ -15,6 +15,7 @@ from kgcp.cli.options import (
     restart_option,
     unit_option,
 )
+from kgcp.errors import KgcpError
 
 if TYPE_CHECKING:
     from kgcp.pipeline.calibration.results import CalibrationResults
@@ -70,7 +71,7 @@ FORMATS = ("opencv", "ros", "metashape", "colmap", "opensfm", "pix4d", "opf", "m
     "is_same_aspect",
     default=None,
     help="Estimate one focal length, or fx and fy.  [default: one; with --model auto, two where the"
-    " difference is significant and the format can hold it]",
+    " difference is significant]",
 )
 @click.option(
     "--response",
@@ -154,17 +155,14 @@ def command(
     from kgcp.report.plotting import load_matplotlib
 
     load_matplotlib()  # before the report does
-    from kgcp.pipeline.calibration.results import FIELD_FILES, settings_for, write_results
+    from kgcp.pipeline.calibration.results import FIELD_FILES, require_formats, write_results
 
     field = read_field(field_text, unit)
     refuse_to_overwrite_field(field_text, [out / name for name in FIELD_FILES])
     settings = CalibrationSettings(PointModel(points), LensModel(lens), is_same_aspect)
+    require_formats(formats, settings)
     options = CalibrationOptions(
-        settings_for(formats, settings),
-        Response(response),
-        Operator(operator),
-        jobs,
-        is_restart=is_restart,
+        settings, Response(response), Operator(operator), jobs, is_restart=is_restart
     )
     found = find_photos(photos)
     other = None if against is None else read_other(against, found)
@@ -175,12 +173,23 @@ def command(
         import json
 
         files = [str(path) for path in results.files]
-        told = {"files": files, "not_renewed": results.not_renewed}
+        told = {
+            "files": files,
+            "left_out": results.left_out,
+            "not_renewed": results.not_renewed,
+        }
         click.echo(json.dumps({**results.summary, **told}))
     if log_json:
         log.event("summary", **results.summary)
     elif not is_quiet:
         _report(results)
+    if results.left_out:
+        (why,) = set(results.left_out.values())
+        raise KgcpError(
+            f"{', '.join(results.left_out)}: left out, because {why}; all else is written. Choose"
+            " other formats, or calibrate with one focal length",
+            option="same-aspect",
+        )
 
 
 def _report(results: CalibrationResults) -> None:

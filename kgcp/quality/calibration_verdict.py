@@ -11,7 +11,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import rotation_onto
-from kgcp.network.calibration_records import CameraCalibration, PointModel
+from kgcp.network.calibration_records import CameraCalibration, LensModel, PointModel
 from kgcp.network.equations import view_rows, whitened
 from kgcp.network.records import PointPrior
 from kgcp.network.sheet_bends import bend_displacements
@@ -385,6 +385,8 @@ def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
     if numbers.coverage < _COVERAGE:
         yield "Bring the field into the corners of the frame."
     if calibration.dropped or _fits_badly(numbers):
+        if _is_aspect_untried(calibration):
+            yield "Estimate two focal lengths: the pixels may not be square."
         yield (
             "Keep zoom, focus and crop the same in all photographs, none turned afterwards, and the"
             " field rigid. If those that do not fit are the only ones to reach the corners, it may"
@@ -398,6 +400,13 @@ def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
     yield from _field_advice(calibration, numbers)
     if numbers.light is not None and numbers.light.doubt:
         yield "Give photographs as the camera took them, no negatives, and white not burnt."
+
+
+def _is_aspect_untried(calibration: CameraCalibration) -> bool:
+    """Return whether the camera has one focal length because nobody tried two."""
+    settings = calibration.settings
+    is_tried = settings.lens is LensModel.AUTO and settings.is_same_aspect is None
+    return "fy" not in calibration.network.model.names and not is_tried
 
 
 def _field_advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iterator[str]:

@@ -61,6 +61,15 @@ def run(*arguments: object) -> Result:
 def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five photographs of a field, one of nothing, and one file that is none."""
     folder = tmp_path_factory.mktemp("photos")
+    take_photographs(folder, CAMERA)
+    cv2.imwrite(str(folder / "photo10.png"), np.full((300, 400), 180, dtype=np.uint8))
+    (folder / "photo11.png").write_bytes(b"nothing")
+    (folder / "field.toml").write_text(FIELD_TOML)
+    return folder
+
+
+def take_photographs(folder: Path, camera: Camera) -> None:
+    """Render the field, tilted five times and turned every other time."""
     rng = np.random.default_rng(18)
     discs = tuple(
         SimulatedDisc(tuple(point), 2.0 * radius, 2.0 * inner)
@@ -79,13 +88,9 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
         rotation = rotation_about(np.array([*tilt, 0.0])) @ turn
         shift = np.array([0.01 * (index - 2), 0.004 * index, 0.21])
         grey = photograph(
-            CAMERA, Pose(rotation, shift - rotation @ middle), scene, Optics(0.6), sensor, rng
+            camera, Pose(rotation, shift - rotation @ middle), scene, Optics(0.6), sensor, rng
         )
         cv2.imwrite(str(folder / f"photo{index + 1}.png"), grey)
-    cv2.imwrite(str(folder / "photo10.png"), np.full((300, 400), 180, dtype=np.uint8))
-    (folder / "photo11.png").write_bytes(b"nothing")
-    (folder / "field.toml").write_text(FIELD_TOML)
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -159,6 +164,29 @@ def test_the_same_photographs_give_the_same_bytes(
     for name in ("camera.toml", "calibration.json", "observations.parquet", "field.csv"):
         assert (tmp_path / name).read_bytes() == (calibration[0] / name).read_bytes(), name
     assert not list(tmp_path.glob(".*"))  # no journal is left
+
+
+def test_a_format_with_one_focal_length_does_not_force_it_on_the_camera(tmp_path: Path) -> None:
+    folder, out = tmp_path / "photos", tmp_path / "out"
+    folder.mkdir()
+    take_photographs(folder, replace(CAMERA, fy=370.0))
+    (folder / "field.toml").write_text(FIELD_TOML)
+    formats = ("--format", "pix4d", "--format", "opencv", "--format", "mmvii")
+    result = run(folder, "--field", folder / "field.toml", "--out", out, *QUIET, "--json", *formats)
+    assert result.exit_code == 1
+    assert result.stderr.startswith(
+        "kgcp: error: pix4d, mmvii: left out, because fx and fy differ by "
+    )
+    assert result.stderr.endswith("or calibrate with one focal length (--same-aspect)\n")
+    assert result.stderr.count("\n") == 1
+    told = json.loads(result.stdout)
+    assert list(told["left_out"]) == ["pix4d", "mmvii"]
+    assert told["not_used"] == {}
+    written = {Path(name).name for name in told["files"]}
+    assert written == {path.name for path in out.iterdir()} >= {"camera.toml", "opencv.yml"}
+    camera, _ = read_camera_file(out / "camera.toml")
+    assert camera.fx == pytest.approx(390.0, abs=2.0)
+    assert camera.fy == pytest.approx(370.0, abs=2.0)
 
 
 def test_cameras_of_an_earlier_run_are_named(photos: Path, tmp_path: Path) -> None:

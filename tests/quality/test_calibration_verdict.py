@@ -104,6 +104,16 @@ def test_two_focal_lengths_are_estimated_where_they_differ() -> None:
     assert "fy" not in wider.tangled
 
 
+def test_pixels_that_are_not_square_are_thought_of_where_one_focal_length_fits_badly() -> None:
+    """The advice spoke of zoom and focus only."""
+    hint = "Estimate two focal lengths: the pixels may not be square."
+    made = views(camera=replace(CAMERA, fy=1530.0))
+    radial = calibrated(made)
+    assert hint in judge(radial, calibration_numbers(radial)).advice
+    chosen = calibrated(made, lens=LensModel.AUTO)
+    assert hint not in judge(chosen, calibration_numbers(chosen)).advice
+
+
 def test_what_neglected_eccentricity_costs_is_what_an_adjustment_loses() -> None:
     made = views(noise_px=0.0)
     told = change_if_neglected(calibrated(made))

@@ -281,6 +281,9 @@ _FORMATS: Mapping[str, tuple[str, Callable[[CalibratedCamera], str]]] = {
 CAMERA_FORMATS = tuple(_FORMATS)
 """Names of the formats."""
 
+ONE_FOCAL_LENGTH = ("pix4d", "opf", "mmvii")
+"""Those that hold no camera whose fx and fy differ."""
+
 
 def camera_file(made: CalibratedCamera, form: str) -> tuple[str, str]:
     """Return the name and the text of a camera's file.

@@ -5,19 +5,23 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from kgcp import __version__
-from kgcp.errors import KgcpError
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS
 from kgcp.geometry.camera import Camera
 from kgcp.io.files.atomic import write_all
 from kgcp.io.flight.camera_file import camera_toml
 from kgcp.io.flight.field_file import field_toml
-from kgcp.io.formats.camera_writers import CalibratedCamera, camera_file, not_renewed
+from kgcp.io.formats.camera_writers import (
+    ONE_FOCAL_LENGTH,
+    CalibratedCamera,
+    camera_file,
+    not_renewed,
+)
 from kgcp.io.tables.calibration import (
     FIELD_COLUMNS,
     OBSERVATION_COLUMNS,
@@ -55,6 +59,7 @@ class CalibrationResults:
     """What was written, and what it says."""
 
     files: tuple[Path, ...]
+    left_out: dict[str, str]  # formats asked for, and why they cannot hold the camera
     not_renewed: tuple[str, ...]  # formats of which an earlier run has left files
     numbers: CalibrationNumbers
     verdict: CalibrationVerdict
@@ -62,28 +67,18 @@ class CalibrationResults:
     summary: dict[str, object]  # calibration.json
 
 
-def settings_for(formats: Sequence[str], settings: CalibrationSettings) -> CalibrationSettings:
-    """Return settings whose camera all formats can hold, before anything is measured.
+def require_formats(formats: Sequence[str], settings: CalibrationSettings) -> None:
+    """Refuse formats that cannot hold the model asked for, before anything is measured.
 
-    Whether fx and fy are two, if that was left open, depends on it.
+    Whether fx and fy are two, if that was left open, only the photographs say.
 
     Raises
     ------
     KgcpError
         Naming the terms that a format cannot hold.
     """
+    fy = 101.0 if settings.is_same_aspect is False else 100.0
     k4 = 0.01 if settings.lens is LensModel.RATIONAL else 0.0
-    _require_formats(formats, is_same_aspect=settings.is_same_aspect is not False, k4=k4)
-    if settings.is_same_aspect is None:
-        try:
-            _require_formats(formats, is_same_aspect=False, k4=k4)
-        except KgcpError:
-            return replace(settings, is_same_aspect=True)
-    return settings
-
-
-def _require_formats(formats: Sequence[str], *, is_same_aspect: bool, k4: float) -> None:
-    fy = 100.0 if is_same_aspect else 101.0
     camera = Camera(100, 100, 100.0, fy, 50.0, 50.0, k4=k4)
     size = len(CALIBRATION_PARAMETERS)
     for form in formats:
@@ -106,6 +101,9 @@ def write_results(
 ) -> CalibrationResults:
     """Write all files of a calibration into a folder.
 
+    A format with one focal length is left out if the camera has two: a camera that was made to have
+    one would fit worse, for all other files as well.
+
     Parameters
     ----------
     other : OtherCalibration, optional
@@ -116,7 +114,7 @@ def write_results(
     Raises
     ------
     KgcpError
-        If a format cannot hold the camera, or a file cannot be written.
+        If a format cannot hold the lens's model, or a file cannot be written.
     """
     calibration = made.calibration
     numbers = calibration_numbers(calibration, light_of(made))
@@ -126,7 +124,8 @@ def write_results(
         difference = compare_cameras(calibration.camera, other.camera)
         comparison = CameraComparison(other.name, other.camera, difference)
     exported = CalibratedCamera(calibration.camera, calibration.covariance.cov, numbers.rms_px)
-    texts = dict(camera_file(exported, form) for form in formats)
+    left_out = _left_out(calibration.camera, formats)
+    texts = dict(camera_file(exported, form) for form in formats if form not in left_out)
     texts[CAMERA_FILE] = camera_toml(calibration.camera, calibration.covariance)
     stated, adjusted = FIELD_FILES
     texts[stated] = field_toml(calibration.field)
@@ -152,8 +151,15 @@ def write_results(
     write_all({out / name: text.encode() for name, text in texts.items()})
     files = tuple(out / name for name in names)
     return CalibrationResults(
-        files, not_renewed(out, files), numbers, verdict, tuple(photos), summary
+        files, left_out, not_renewed(out, files), numbers, verdict, tuple(photos), summary
     )
+
+
+def _left_out(camera: Camera, formats: Sequence[str]) -> dict[str, str]:
+    """Return the formats that have no place for the camera's second focal length, and why."""
+    difference_px = abs(camera.fx - camera.fy)
+    why = f"fx and fy differ by {difference_px:.2g} px, and the format holds one focal length"
+    return {form: why for form in formats if form in ONE_FOCAL_LENGTH and difference_px > 0.0}
 
 
 def _summary(
