@@ -155,7 +155,8 @@ def _chosen(problem: CalibrationProblem, state: AdjustedNetwork) -> _Chosen:
     points = problem.settings.points
     if points is PointModel.FIXED:
         return _Chosen(problem, fixed, fixed, points, is_turn_unclear=False)
-    state = problem.adjusted(fixed.camera, fixed.estimate, replace(fixed.unknowns, points=points))
+    # with k1 and k2 only, and all others once the field has its shape: they would follow its errors
+    state = problem.adjusted(state.camera, state.estimate, replace(state.unknowns, points=points))
     is_turn_unclear = False
     if any(view.is_symmetric for view in problem.views):
         problem, state, is_turn_unclear = with_turns(problem, state)

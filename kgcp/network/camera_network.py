@@ -115,10 +115,9 @@ class CalibrationProblem:
 
     def with_unknowns(self, state: AdjustedNetwork, unknowns: NetworkUnknowns) -> AdjustedNetwork:
         """Return the adjustment of other unknowns; bends are those of the state, estimated anew."""
-        bends, points = state.network.bends, state.unknowns.points
-        if bends is None or points is not unknowns.points:
+        if state.unknowns.points is not unknowns.points:
             return self.adjusted(state.camera, state.estimate, unknowns)
-        cov = state.network.observations.cov
+        cov, bends = state.network.observations.cov, state.network.bends
         return self._settled(state.camera, state.estimate, unknowns, cov, bends)
 
     def with_estimate(self, state: AdjustedNetwork, estimate: Estimate) -> AdjustedNetwork:
@@ -133,7 +132,20 @@ class CalibrationProblem:
         The covariances of the discs are made to fit their residuals, so that priors, which are
         absolute, get the weight that they deserve.
         """
-        return self._settled(camera, estimate.unbent(0), unknowns, self.observations().cov, None)
+        start, cov = estimate.unbent(0), self.observations().cov
+        # Errors of a field that stays as stated would outweigh priors from the beginning, and terms
+        # that can hardly be told apart grow to poles of the rational model between the discs. Those
+        # of a field that may move are no noise: it would hardly leave its place.
+        if unknowns.points is PointModel.FIXED:
+            cov = self._fitting_at(camera, start)
+        return self._settled(camera, start, unknowns, cov, None)
+
+    def _fitting_at(self, camera: Camera, estimate: Estimate) -> FloatArray:
+        """Return covariances (n, 2, 2) of the discs that agree with an estimate to start from."""
+        observed = self.observations()
+        circles = observed_circles(self.field, estimate, observed)
+        squares = np.sum((observed.places - camera.project(circles.centres_m)) ** 2, axis=1)
+        return np.asarray(observed.cov + 0.5 * np.median(squares) * np.eye(2))
 
     def bent(self, state: AdjustedNetwork) -> AdjustedNetwork:
         """Return the adjustment of a free field that bends, or `state` if it hardly does.

@@ -114,6 +114,16 @@ def test_pixels_that_are_not_square_are_thought_of_where_one_focal_length_fits_b
     assert hint not in judge(chosen, calibration_numbers(chosen)).advice
 
 
+@pytest.mark.parametrize("points", [PointModel.FIXED, PointModel.STIFF])
+def test_a_rational_model_keeps_its_terms_small_on_a_field_with_errors(points: PointModel) -> None:
+    """Its terms grew against each other to a pole, and the photographs were blamed for it."""
+    errors_m = 0.0002 * np.random.default_rng(3).standard_normal((len(FIELD.names()), 3))
+    result = calibrated(views(bend_m=errors_m, noise_px=0.2 * SD_PX), points, LensModel.RATIONAL)
+    assert np.abs([result.camera.k1, result.camera.k4]).max() < 0.3
+    assert result.camera.fx == pytest.approx(1500.0, abs=3.0)
+    assert set(result.undetermined) >= {"k1", "k4"}  # which can hardly be told apart
+
+
 def test_what_neglected_eccentricity_costs_is_what_an_adjustment_loses() -> None:
     made = views(noise_px=0.0)
     told = change_if_neglected(calibrated(made))
