@@ -237,6 +237,48 @@ def test_another_calibration_is_compared_with(
     assert "wide.toml: is for frames of 401 x 300 px" in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        (
+            "cameras.txt",
+            "1 SIMPLE_PINHOLE 640 480 500 320 240\n",
+            "is for 640 x 480 px, but the photographs have 400 x 300; use the calibration of",
+        ),
+        (
+            "cameras.txt",
+            "".join(f"{k} SIMPLE_PINHOLE 400 300 390 200 150\n" for k in (1, 2)),
+            "holds the cameras '1', '2'; give a file of one camera",
+        ),
+        (
+            "opencv.yml",
+            "%YAML:1.0\n---\ndistortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 4\n"
+            "   dt: d\n   data: [ 0., 0., 0., 0. ]\n",
+            "has no camera_matrix; add it or use another calibration",
+        ),
+        (
+            "pix4d.cam",
+            "Pix4D camera calibration file 0\n"
+            "#Focal Length mm assuming a sensor width of 0.3x0.4mm\n"
+            "F 0.4\nPx 0.15\nPy 0.2\nK1 0\nK2 0\nK3 0\nT1 0\nT2 0\n",
+            "is not of the shape of 400 x 300 px; use the calibration of this frame size",
+        ),
+        ("notes.txt", "my camera\n", "; convert it or write the values to a camera.toml"),
+    ],
+)
+def test_a_mistake_in_another_calibration_is_not_sought_in_a_flight(
+    photos: Path, tmp_path: Path, name: str, text: str, message: str
+) -> None:
+    """There is no flight.toml, whose [camera] messages used to speak of."""
+    other = tmp_path / name
+    other.write_text(text)
+    result = run(photos, "--field", photos / "field.toml", "--against", other, *QUIET)
+    assert result.exit_code == 1
+    assert result.stderr.startswith(f"kgcp: error: {other}")
+    assert message in result.stderr
+    assert "[camera]" not in result.stderr
+
+
 def test_too_few_photographs_are_one_line(photos: Path, tmp_path: Path) -> None:
     files = [photos / "photo1.png", photos / "photo2.png", photos / "photo10.png"]
     result = run(*files, "--field", photos / "field.toml", "--out", tmp_path, *QUIET)

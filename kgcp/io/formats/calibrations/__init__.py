@@ -8,6 +8,7 @@ line or element, for a file that is not as its format says.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from kgcp.errors import KgcpError, SettingError
@@ -46,19 +47,41 @@ FORMATS: Registry[Callable[[ForeignFile], Sequence[Entry]]] = Registry(
 )
 
 
+@dataclass(frozen=True, slots=True)
+class Asker:
+    """Who names a calibration file, and what is to be done there: the words of messages."""
+
+    key: str  # that names the file
+    size: str  # who says how large frames are
+    add_size: str
+    choose_camera: str
+    write_values: str
+
+
+FLIGHT = Asker(
+    "[camera] file",
+    "but [camera] says",
+    "add width and height to [camera]",
+    "choose one with [camera] camera",
+    FORMATS.remedy,
+)
+"""A flight.toml."""
+
+
 def read_calibration(
     path: Path,
     stated_size: tuple[int | None, int | None],
     form: str | None = None,
     camera: str | None = None,
+    asker: Asker = FLIGHT,
 ) -> Camera:
     """Read a calibration file of one of the `FORMATS`; docs/foreign_files.md has their conversions.
 
     Parameters
     ----------
     stated_size : tuple of int or None
-        Width and height [px] that flight.toml gives beside the file: needed where the file is
-        silent, else they must agree.
+        Width and height [px] that `asker` gives beside the file: needed where the file is silent,
+        else they must agree.
     form : str or None
         Name of the format; None: the content tells.
     camera : str or None
@@ -70,16 +93,17 @@ def read_calibration(
         If the file is missing, is of no known format, lacks the size or the camera, or holds a
         model that `Camera` cannot represent exactly; it names the term.
     """
-    file = ForeignFile(path, "[camera] file")
-    entry = _chosen(file, FORMATS.reader(file, form)(file), camera)
-    width, height = _agreed_size(file, entry, stated_size)
+    file = ForeignFile(path, asker.key)
+    read = replace(FORMATS, remedy=asker.write_values).reader(file, form)
+    entry = _chosen(file, read(file), camera, asker)
+    width, height = _agreed_size(file, entry, stated_size, asker)
     try:
         return entry.convert(width, height)
     except SettingError as error:
         raise KgcpError(f"{path}: {error}") from None
 
 
-def _chosen(file: ForeignFile, entries: Sequence[Entry], camera: str | None) -> Entry:
+def _chosen(file: ForeignFile, entries: Sequence[Entry], camera: str | None, asker: Asker) -> Entry:
     """Return the camera of that name, or the only one."""
     if not entries:
         raise file.error("holds no camera", "export the calibration again")
@@ -87,7 +111,7 @@ def _chosen(file: ForeignFile, entries: Sequence[Entry], camera: str | None) -> 
     if camera is None:
         if len(entries) == 1:
             return entries[0]
-        raise file.error(f"holds the cameras {_listed(names)}", "choose one with [camera] camera")
+        raise file.error(f"holds the cameras {_listed(names)}", asker.choose_camera)
     chosen = [entry for entry in entries if entry.name == camera]
     if len(chosen) != 1:
         count = "several cameras" if chosen else "no camera"
@@ -103,12 +127,12 @@ def _listed(names: Sequence[str], most: int = 8) -> str:
 
 
 def _agreed_size(
-    file: ForeignFile, entry: Entry, stated: tuple[int | None, int | None]
+    file: ForeignFile, entry: Entry, stated: tuple[int | None, int | None], asker: Asker
 ) -> tuple[int, int]:
     width, height = stated
     if entry.size is None:
         if width is None or height is None:
-            raise file.error("has no image size", "add width and height to [camera]")
+            raise file.error("has no image size", asker.add_size)
         return width, height
     found_width, found_height = entry.size
     if min(entry.size) < 1:
@@ -116,7 +140,7 @@ def _agreed_size(
     size = (width or found_width, height or found_height)
     if size != entry.size and not (entry.is_relative and _same_shape(size, entry.size)):
         raise file.error(
-            f"is for {found_width} x {found_height} px, but [camera] says {size[0]} x {size[1]}",
+            f"is for {found_width} x {found_height} px, {asker.size} {size[0]} x {size[1]}",
             "use the calibration of this frame size",
         )
     return size

@@ -50,7 +50,7 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
     if is_fisheye:
         raise unsupported(file, "a fisheye model")
     if matrix is None:
-        raise file.error("has no camera_matrix", "add it or write the values to [camera]")
+        raise file.error("has no camera_matrix", "add it or use another calibration")
     size = (int(width), int(height)) if width and height else None
     return (opencv_entry("", size, matrix, coefficients or []),)
 

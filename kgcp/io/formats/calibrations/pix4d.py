@@ -90,7 +90,7 @@ def _mm_entry(file: ForeignFile, name: str, block: str) -> Entry:
                 where,
                 f"has a sensor of {width_mm:g} x {height_mm:g} mm, which is not of the shape of"
                 f" {width} x {height} px",
-                "correct width and height in [camera]",
+                "use the calibration of this frame size",
             )
         lengths = [per_mm * number(key) for key in ("F", "F", "Px", "Py")]
         terms = [number(key) for key in ("K1", "K2", "K3", "T1", "T2")]
