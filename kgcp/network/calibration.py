@@ -119,7 +119,7 @@ def _calibrated(problem: CalibrationProblem, start: CameraCalibration | None) ->
     # only the photographs dropped by the earlier calibration are dropped now
     disordered = () if start is not None else _disordered(problem)
     problem = replace(problem, views=tuple(v for v in problem.views if v.photo not in disordered))
-    _require_views(problem.views)
+    _require_views(problem.views, disordered)
     observations = problem.observations()
     unknowns = NetworkUnknowns(PointModel.FIXED, ("k1", "k2"), is_same_aspect=True)
     if start is None:
@@ -178,12 +178,17 @@ def _with_bends(chosen: _Chosen) -> _Chosen:
     return replace(chosen, state=with_chosen_parameters(problem, bent))
 
 
-def _require_views(views: Sequence[NamedView]) -> None:
-    if len(views) < LEAST_VIEWS:
+def _require_views(views: Sequence[NamedView], disordered: Sequence[str] = ()) -> None:
+    if len(views) >= LEAST_VIEWS:
+        return
+    problem = f"{len(views)} of the photographs show the field, and {LEAST_VIEWS} are needed"
+    if disordered:
         raise KgcpError(
-            f"{len(views)} of the photographs show the field, and {LEAST_VIEWS} are needed; take"
-            " more, or correct the description of the field"
+            f"{problem}: discs do not lie like those of a plane with their names in"
+            f" {', '.join(disordered)}; correct the places and names in the field's description, or"
+            " take others if the field was bent or moved"
         )
+    raise KgcpError(f"{problem}; take more, or correct the description of the field")
 
 
 def _disordered(problem: CalibrationProblem) -> tuple[str, ...]:

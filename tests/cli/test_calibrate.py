@@ -283,7 +283,11 @@ def test_too_few_photographs_are_one_line(photos: Path, tmp_path: Path) -> None:
     files = [photos / "photo1.png", photos / "photo2.png", photos / "photo10.png"]
     result = run(*files, "--field", photos / "field.toml", "--out", tmp_path, *QUIET)
     assert result.exit_code == 1
-    assert "the field is found in 2 of 3 photographs (1 too_few), and 3 are needed" in result.stderr
+    assert (
+        "2 of 3 photographs can be used, and 3 are needed; left out: 1 too_few (photo10.png: "
+        in (result.stderr)
+    )
+    assert result.stderr.endswith("; show the whole field, from nearer and sharp\n")
     assert not (tmp_path / "camera.toml").exists()
 
 
@@ -296,7 +300,25 @@ def test_copies_and_damaged_files_do_not_count(photos: Path, tmp_path: Path) -> 
     (folder / "d.png").write_bytes(content[: len(content) // 2])
     result = run(folder, "--field", photos / "field.toml", "--out", tmp_path / "out", *QUIET)
     assert result.exit_code == 1
-    assert "found in 2 of 4 photographs (1 decode_failed, 1 duplicate), and 3" in result.stderr
+    assert "2 of 4 photographs can be used, and 3 are needed; left out: 1 dup" in result.stderr
+    assert "1 duplicate (b.png: of a.png), 1 decode_failed (d.png: " in result.stderr
+    assert "; take more photographs, each from another place; copy the files again" in result.stderr
+    assert "description" not in result.stderr  # of the field, which is right
+
+
+def test_photographs_of_two_sizes_are_not_the_field_s_fault(photos: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for index in (1, 2, 3, 4):
+        grey = cv2.imread(str(photos / f"photo{index}.png"), cv2.IMREAD_GRAYSCALE)
+        assert grey is not None
+        cv2.imwrite(str(folder / f"{index}.png"), grey if index < 3 else np.rot90(grey))
+    result = run(folder, "--field", photos / "field.toml", "--out", tmp_path / "out", *QUIET)
+    assert result.exit_code == 1
+    assert "left out: 2 other_size (3.png: 300 x 400 px, most have 400 x 300, which is" in (
+        result.stderr
+    )
+    assert result.stderr.endswith("of one size, none of them turned or cropped afterwards\n")
 
 
 def test_two_focal_lengths_are_two_cameras(photos: Path, tmp_path: Path) -> None:
@@ -326,7 +348,7 @@ def test_a_field_in_one_row_is_not_enough(photos: Path, tmp_path: Path) -> None:
         cv2.imwrite(str(folder / f"{index}.png"), grey)
     result = run(folder, "--field", photos / "field.toml", "--out", tmp_path / "out", *QUIET)
     assert result.exit_code == 1
-    assert "the field is found in 0 of 3 photographs" in result.stderr
+    assert "0 of 3 photographs can be used" in result.stderr
 
 
 def test_two_fields_in_each_photograph_are_to_be_covered(photos: Path, tmp_path: Path) -> None:
@@ -339,7 +361,8 @@ def test_two_fields_in_each_photograph_are_to_be_covered(photos: Path, tmp_path:
         )
     result = run(folder, "--field", photos / "field.toml", "--out", tmp_path / "out", *QUIET)
     assert result.exit_code == 1
-    assert "(3 two_fields), and 3 are needed; cover all but one field" in result.stderr
+    assert "; left out: 3 two_fields (1.png" in result.stderr
+    assert "; cover all but one field" in result.stderr
 
 
 def test_photographs_of_another_size_are_left_out(photos: Path, tmp_path: Path) -> None:
@@ -401,13 +424,13 @@ def test_a_board_without_a_unit_asks_for_it(photos: Path, tmp_path: Path) -> Non
     assert "(--unit)" in result.stderr
     files = (photos / "photo1.png", photos / "photo2.png")
     result = run(*files, "--field", board, "--unit", "cm", "--out", out, *QUIET)
-    assert "the field is found in 2 of 2 photographs, and 3 are needed; take" in result.stderr
+    assert "2 of 2 photographs can be used, and 3 are needed; take more, 12" in result.stderr
 
 
 def test_a_row_too_many_in_the_description_is_one_line(photos: Path, tmp_path: Path) -> None:
     result = run(photos, "--field", "grid:5x5:30mm:16mm", "--out", tmp_path, *QUIET)
     assert result.exit_code == 1
-    assert "(5 ambiguous, " in result.stderr
+    assert "left out: 5 ambiguous (photo1.png" in result.stderr
     assert (
         "correct the field's columns, rows and marks, or show all of it or a mark" in result.stderr
     )

@@ -580,3 +580,11 @@ def test_a_field_that_is_never_tilted_is_no_traceback() -> None:
 def test_two_photographs_are_too_few() -> None:
     with pytest.raises(KgcpError, match="2 of the photographs show the field, and 3 are needed"):
         calibrated(views()[:2])
+
+
+def test_photographs_with_wrong_names_are_named_where_too_few_others_are_left() -> None:
+    made = views()[:4]
+    shuffled = np.random.default_rng(1).permutation(len(made[0].point))
+    wrong = [replace(view, point=view.point[shuffled]) for view in made[2:]]
+    with pytest.raises(KgcpError, match=r"2 of the photographs .*: discs do not lie .* in p2, p3;"):
+        calibrated([*made[:2], *wrong])

@@ -68,6 +68,26 @@ REASONS: Mapping[str, str] = {
 }
 """Why a photograph is not used: the words of the `reason` column."""
 
+_REMEDIES: Mapping[str, str] = {
+    Reason.DECODE_FAILED.value: Reason.DECODE_FAILED.remedy,
+    Reason.WORKER_DIED.value: Reason.WORKER_DIED.remedy,
+    Reason.TIMED_OUT.value: "look at the files that take so long",
+    NamingProblem.TOO_FEW.value: "show the whole field, from nearer and sharp",
+    NamingProblem.NO_LATTICE.value: "correct the description of the field",
+    NamingProblem.TWO_FIELDS.value: (
+        "cover all but one field in each photograph; cropped ones cannot be used"
+    ),
+    NamingProblem.AMBIGUOUS.value: (
+        "correct the field's columns, rows and marks, or show all of it or a mark; mirrored"
+        " photographs cannot be used"
+    ),
+    OTHER_SIZE: "give photographs of one size, none of them turned or cropped afterwards",
+    DUPLICATE: "take more photographs, each from another place",
+}
+_NONE_FOUND_REMEDY = (
+    "correct the field's polarity (':bright' for bright discs on dark ground), or come nearer"
+)
+
 _Item = TypeVar("_Item", Photo, SecondLook)
 
 
@@ -331,27 +351,9 @@ def _without_duplicates(
 def _views(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[NamedView]:
     found = [result for result in results if isinstance(result, PhotoDiscs)]
     if len(found) < LEAST_VIEWS:
-        reasons = Counter(result.reason for result in results if isinstance(result, PhotoMiss))
-        why = ", ".join(f"{count} {reason}" for reason, count in sorted(reasons.items()))
-        usual = max(reasons, key=reasons.__getitem__, default="")
-        remedy = "take more photographs, 12 at best"
-        if NamingProblem.AMBIGUOUS in reasons:
-            remedy = (
-                "correct the field's columns, rows and marks, or show all of it or a mark;"
-                " mirrored photographs cannot be used"
-            )
-        elif usual == NamingProblem.TOO_FEW:
-            remedy = (
-                "correct the field's polarity (':bright' for bright discs on dark ground), or come"
-                " nearer"
-            )
-        elif usual == NamingProblem.TWO_FIELDS:
-            remedy = "cover all but one field in each photograph; cropped ones cannot be used"
-        elif why:
-            remedy = "correct the description of the field, or take more photographs"
         raise KgcpError(
-            f"the field is found in {len(found)} of {len(results)} photographs"
-            f"{f' ({why})' if why else ''}, and {LEAST_VIEWS} are needed; {remedy}"
+            f"{len(found)} of {len(results)} photographs can be used, and {LEAST_VIEWS} are needed;"
+            f" {_about_misses(results) or 'take more, 12 at best'}"
         )
     return [
         NamedView(
@@ -363,6 +365,25 @@ def _views(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[NamedView]:
         )
         for result in found
     ]
+
+
+def _about_misses(results: Sequence[PhotoDiscs | PhotoMiss]) -> str:
+    """Return which photographs are left out and why, the commonest reason first, and remedies."""
+    misses: dict[str, list[PhotoMiss]] = {}
+    for result in results:
+        if isinstance(result, PhotoMiss):
+            misses.setdefault(result.reason, []).append(result)
+    reasons = sorted(misses, key=lambda reason: -len(misses[reason]))
+    counts, remedies = [], []
+    for reason in reasons:
+        first = misses[reason][0]
+        example = f"{first.photo}: {first.detail}" if first.detail else first.photo
+        counts.append(f"{len(misses[reason])} {reason} ({example})")
+        remedies.append(_REMEDIES[reason])
+    is_any_found = sum(map(len, misses.values())) < len(results)
+    if NamingProblem.TOO_FEW in misses and not is_any_found:
+        remedies[reasons.index(NamingProblem.TOO_FEW)] = _NONE_FOUND_REMEDY
+    return f"left out: {', '.join(counts)}; {'; '.join(remedies)}" if counts else ""
 
 
 def _size(results: Sequence[PhotoDiscs | PhotoMiss]) -> tuple[int, int]:
