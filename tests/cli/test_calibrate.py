@@ -252,15 +252,19 @@ def test_another_calibration_is_compared_with(
         ),
         (
             "opencv.yml",
-            "%YAML:1.0\n---\ndistortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 4\n"
-            "   dt: d\n   data: [ 0., 0., 0., 0. ]\n",
+            (
+                "%YAML:1.0\n---\ndistortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 4\n"
+                "   dt: d\n   data: [ 0., 0., 0., 0. ]\n"
+            ),
             "has no camera_matrix; add it or use another calibration",
         ),
         (
             "pix4d.cam",
-            "Pix4D camera calibration file 0\n"
-            "#Focal Length mm assuming a sensor width of 0.3x0.4mm\n"
-            "F 0.4\nPx 0.15\nPy 0.2\nK1 0\nK2 0\nK3 0\nT1 0\nT2 0\n",
+            (
+                "Pix4D camera calibration file 0\n"
+                "#Focal Length mm assuming a sensor width of 0.3x0.4mm\n"
+                "F 0.4\nPx 0.15\nPy 0.2\nK1 0\nK2 0\nK3 0\nT1 0\nT2 0\n"
+            ),
             "is not of the shape of 400 x 300 px; use the calibration of this frame size",
         ),
         ("notes.txt", "my camera\n", "; convert it or write the values to a camera.toml"),
