@@ -43,12 +43,20 @@ class Log:
         Disabled where it is not wanted.
     rounds : int
         How often the run goes through all frames: once, or twice if it draws them.
+    unit : str
+        What is counted.
     """
 
     def __init__(
-        self, bar: tqdm[NoReturn], *, is_quiet: bool, as_json: bool, rounds: int = 1
+        self,
+        bar: tqdm[NoReturn],
+        *,
+        is_quiet: bool,
+        as_json: bool,
+        rounds: int = 1,
+        unit: str = "frame",
     ) -> None:
-        self._bar = bar
+        self._bar, self._unit = bar, unit
         self.is_quiet, self.is_json = is_quiet, as_json
         self._rounds = rounds
         self._due_s = 0.0
@@ -111,7 +119,7 @@ class Log:
             self.event("stopped", stage=self._stage, done=self.done, total=self.total)
         else:
             where = f"{self._stage}: " if self._stage else ""
-            text = f"{where}{self.done} of {counted(self.total, 'frame')} processed"
+            text = f"{where}{self.done} of {counted(self.total, self._unit)} processed"
             click.echo(
                 f"kgcp: stopped; {text}; results kept: repeat the command to resume", err=True
             )
@@ -129,7 +137,7 @@ def log_to_stderr(
     from tqdm import tqdm
 
     with tqdm(unit=unit, disable=is_quiet or as_json) as bar:
-        log = Log(bar, is_quiet=is_quiet, as_json=as_json, rounds=rounds)
+        log = Log(bar, is_quiet=is_quiet, as_json=as_json, rounds=rounds, unit=unit)
         patience = Timer(_PATIENCE_S, log.explain_wait)
         if sys.stderr.isatty():  # a person may be waiting
             patience.start()

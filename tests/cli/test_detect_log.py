@@ -40,6 +40,16 @@ def test_a_stopped_run_tells_how_far_it_came(capsys: pytest.CaptureFixture[str])
             assert said in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("is_quiet", [True, False])
+def test_a_stopped_calibration_counts_photographs(
+    capsys: pytest.CaptureFixture[str], *, is_quiet: bool
+) -> None:
+    with log_to_stderr(is_quiet=is_quiet, as_json=False, unit="photo") as log:
+        log.progress("photographs", 7, 12, 7)
+        log.stop()
+    assert "stopped; photographs: 7 of 12 photos processed; results" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("rounds", "expected"), [(1, [3, 9, 9, 9]), (2, [1, 4, 4, 4, 6, 9])])
 def test_one_bar_goes_through_all_stages(
     rounds: int, expected: list[int], capsys: pytest.CaptureFixture[str]
