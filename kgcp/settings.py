@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
+from numbers import Real
+from typing import TypeVar
 
 from kgcp.errors import SettingError
+
+WordT = TypeVar("WordT", bound=StrEnum)
 
 
 def require_range(
@@ -18,11 +23,25 @@ def require_range(
     open_low: bool = False,
 ) -> None:
     """Raise `SettingError` unless low ≤ value ≤ high (low < value with `open_low`)."""
+    if not isinstance(value, Real):  # of a program's caller; flight.toml is read with its types
+        raise SettingError(key, f"{value!r} is not a number", "give a number")
     if (low < value if open_low else low <= value) and value <= high:
         return
-    bounds = f"{'above' if open_low else 'at least'} {low:g} and at most {high:g}"
+    bounds = f"{'above' if open_low else 'at least'} {low:g}"
+    if math.isfinite(high):
+        bounds += f" and at most {high:g}"
     suffix = f" {unit}" if unit else ""
     raise SettingError(key, f"{value:g}{suffix} is out of range", f"give a value {bounds}{suffix}")
+
+
+def require_word(key: str, value: str, words: type[WordT]) -> WordT:
+    """Return the word that a value is, or raise `SettingError` if it is none of them."""
+    try:
+        return words(value)
+    except ValueError as error:
+        raise SettingError(
+            key, f"{value!r} is not a known value", f"give one of {', '.join(words)}"
+        ) from error
 
 
 class Method(StrEnum):
@@ -70,6 +89,7 @@ class DetectSettings:
     max_circle_deviation: float = 0.15
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "method", require_word("method", self.method, Method))
         require_range("min_radius_px", self.min_radius_px, 1.0, 1e4, unit="px")
         require_range("min_score", self.min_score, 0.0, 1.0, open_low=True)
         require_range("false_alarm", self.false_alarm, 0.0, 1.0, open_low=True)

@@ -5,18 +5,26 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import kgcp
+from kgcp.geometry.camera import Response
+from kgcp.settings import Method
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
 RING = kgcp.Ring("A", 0.9, 0.45, 0.642857143, 0.128571429, (0, 43, 78, 180))
 CAMERA = kgcp.Camera(640, 480, 800.0, 800.0, 320.0, 240.0)
+# as a program without types calls them
+make_settings: Any = kgcp.DetectSettings
+changed: Any = replace
 
 
 def test_every_public_name_is_there_and_described() -> None:
@@ -86,3 +94,52 @@ def test_a_frame_without_a_target_is_a_miss() -> None:
     (miss,) = kgcp.measure_frame(np.full((480, 640), 90, np.uint8), CAMERA, [kgcp.Target(RING)])
     assert isinstance(miss, kgcp.Miss)
     assert (miss.target, miss.reason) == ("A", "no_candidate")
+
+
+@pytest.mark.parametrize("word", ["linear", "srgb", "unknown"])
+def test_a_camera_takes_the_response_as_a_word(word: str) -> None:
+    camera = changed(CAMERA, response=word)
+    assert isinstance(camera.response, Response)
+    assert camera == replace(CAMERA, response=Response(word))
+
+
+def test_the_method_is_taken_as_a_word() -> None:
+    assert make_settings(method="paper").method is Method.PAPER
+
+
+@pytest.mark.parametrize(
+    ("make", "problem"),
+    [
+        (lambda: make_settings(method="papers"), "method: 'papers' .* one of model, paper"),
+        (lambda: changed(CAMERA, response="gamma"), "response: 'gamma' .* linear, srgb, unknown"),
+        (lambda: changed(CAMERA, response=None), "response: None is not a known value"),
+        (lambda: changed(CAMERA, time_reference="begin"), "time_reference: .* start, middle, end"),
+        (lambda: changed(CAMERA, width=640.5), "width: 640.5 px is not a whole number"),
+        (lambda: changed(CAMERA, fx="800"), "fx: '800' is not a number"),
+        (lambda: kgcp.RunOptions(jobs=-1), "jobs: -1 is out of range"),
+        (lambda: kgcp.RunOptions(frame_timeout_s=0.0), "frame_timeout_s: 0 s .* a value above 0 s"),
+        (lambda: kgcp.Selection(max_sd_m=np.nan), "max_sd_m: nan m is out of range"),
+        (lambda: kgcp.Selection(min_score=86.0), "min_score: 86 is out of range"),
+        (lambda: kgcp.Selection(min_ambiguity=-1.0), "min_ambiguity: -1 is out of range"),
+        (lambda: kgcp.Selection(min_spacing_m=-5.0), "min_spacing_m: -5 m is out of range"),
+        (lambda: kgcp.Selection(checkpoint_share=20), "checkpoint_share: 20 is out of range"),
+        (
+            lambda: kgcp.measure_frame(np.zeros((480, 640), np.uint8), CAMERA, [RING]),  # type: ignore[list-item]
+            r"targets: has a Ring; give kgcp.Target\(ring\)",
+        ),
+    ],
+)
+def test_wrong_arguments_are_named(make: Callable[[], object], problem: str) -> None:
+    with pytest.raises(kgcp.KgcpError, match=problem):
+        make()
+
+
+def test_targets_may_come_one_by_one() -> None:
+    grey = np.full((480, 640), 90, np.uint8)
+    (miss,) = kgcp.measure_frame(grey, CAMERA, (kgcp.Target(ring) for ring in [RING]))
+    assert isinstance(miss, kgcp.Miss)
+
+
+def test_a_code_may_be_an_array() -> None:
+    code_deg = np.array([180.0, 0.0, 43.0, 78.0])
+    assert kgcp.Ring("A", 0.9, 0.45, 0.642857143, 0.128571429, code_deg) == RING  # type: ignore[arg-type]

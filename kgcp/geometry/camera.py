@@ -25,7 +25,7 @@ from kgcp.geometry.distortion import (
     first_fold_r2,
     undistort_points,
 )
-from kgcp.settings import require_range
+from kgcp.settings import require_range, require_word
 
 
 class Response(StrEnum):
@@ -158,6 +158,9 @@ class Camera:
     def __post_init__(self) -> None:
         for key, size in (("width", self.width), ("height", self.height)):
             require_range(key, size, 2, 100_000, unit="px")
+            if size != int(size):
+                raise SettingError(key, f"{size:g} px is not a whole number", "give whole pixels")
+            object.__setattr__(self, key, int(size))
         for key, focal in (("fx", self.fx), ("fy", self.fy)):
             require_range(key, focal, 0.0, 1e7, unit="px", open_low=True)
         for key, value, size in (("cx", self.cx, self.width), ("cy", self.cy, self.height)):
@@ -171,6 +174,8 @@ class Camera:
             if not math.isfinite(getattr(self, key)):
                 raise SettingError(key, "is not a finite number", "give a number or leave it out")
         require_range("readout_s", self.readout_s, 0.0, 10.0, unit="s")
+        for key, words in (("response", Response), ("time_reference", TimeReference)):
+            object.__setattr__(self, key, require_word(key, getattr(self, key), words))
         require_range("motion_sd_deg_s", self.motion_sd_deg_s, 0.0, 1000.0, unit="deg/s")
 
     def binned(self, count: int) -> Camera:

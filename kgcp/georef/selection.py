@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,6 +16,7 @@ from kgcp.georef.gcp import Flag, Gcp, SkippedSighting, SkipReason
 from kgcp.georef.jumps import find_jumps
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.sighting import Sighting
+from kgcp.settings import require_range
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +46,16 @@ class Selection:
     checkpoint_share: float = 0.0
     keep_flagged: bool = False
     excluded: tuple[tuple[str, str], ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.max_sd_m is not None:
+            require_range("max_sd_m", self.max_sd_m, 0.0, math.inf, unit="m", open_low=True)
+        if self.min_score is not None:
+            require_range("min_score", self.min_score, 0.0, 1.0)
+        if self.min_ambiguity is not None:
+            require_range("min_ambiguity", self.min_ambiguity, 0.0, math.inf)
+        require_range("min_spacing_m", self.min_spacing_m, 0.0, math.inf, unit="m")
+        require_range("checkpoint_share", self.checkpoint_share, 0.0, 1.0)
 
 
 def leave_out(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
@@ -40,7 +41,7 @@ from kgcp.pipeline.overlay import draw_overlay
 from kgcp.pipeline.run_summary import DetectionSummary, Stopwatch, SummaryBuilder
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.report.contact_sheet import ContactSheet
-from kgcp.settings import DetectSettings
+from kgcp.settings import DetectSettings, require_range
 from kgcp.targets.plain import shape_of
 
 
@@ -86,6 +87,13 @@ class RunOptions:
     stored_frames: StoredFolder | None = None
     frame_patterns: tuple[str, ...] = ()
     places: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.jobs is not None:
+            require_range("jobs", self.jobs, 0, 256)
+        require_range(
+            "frame_timeout_s", self.frame_timeout_s, 0.0, math.inf, unit="s", open_low=True
+        )
 
 
 class NoProgress:

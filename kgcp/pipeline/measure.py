@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from kgcp.targets.validation import check_targets
 def measure_frame(
     grey: GreyArray,
     camera: Camera,
-    targets: Sequence[Target],
+    targets: Iterable[Target],
     settings: DetectSettings = DetectSettings(),  # noqa: B008 - frozen
 ) -> list[Outcome]:
     """Find and measure the targets in one frame.
@@ -31,7 +31,7 @@ def measure_frame(
     grey : (height, width) array of uint8 or uint16
         The raw frame: not undistorted, not rotated, of the camera's size. Pixel (0, 0) is the
         centre of the top-left pixel.
-    targets : sequence of Target
+    targets : iterable of Target
         All that may be seen.
 
     Returns
@@ -47,10 +47,14 @@ def measure_frame(
         apart.
     """
     _check_frame(grey, camera)
-    if not targets:
+    wanted = tuple(targets)
+    if not wanted:
         raise KgcpError("targets: is empty; name at least one target to look for")
-    check_targets(tuple(targets))
-    return list(examine(np.ascontiguousarray(grey), camera, tuple(targets), settings).outcomes)
+    for target in wanted:
+        if not isinstance(target, Target):
+            raise KgcpError(f"targets: has a {type(target).__name__}; give kgcp.Target(ring)")
+    check_targets(wanted)
+    return list(examine(np.ascontiguousarray(grey), camera, wanted, settings).outcomes)
 
 
 def _check_frame(grey: GreyArray, camera: Camera) -> None:

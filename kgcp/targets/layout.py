@@ -67,7 +67,7 @@ class Ring:
                 " leave the black ring",
                 "make code_diameter_m ± dot_diameter_m lie between the ring's diameters",
             )
-        if not self.code_deg:
+        if len(self.code_deg) == 0:  # it may be an array
             raise SettingError("code_deg", "is empty", "give the direction of at least one dot")
         if len(self.code_deg) > _MOST_DOTS:
             problem = f"has {len(self.code_deg)} dots"

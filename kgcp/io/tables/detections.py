@@ -6,7 +6,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -49,7 +49,7 @@ from kgcp.measurement.records import (
     Uncertainty,
 )
 from kgcp.quality.learnt_imaging import LearntImaging
-from kgcp.settings import DetectSettings, Method
+from kgcp.settings import DetectSettings
 from kgcp.targets.plain import Shape
 
 if TYPE_CHECKING:  # 0.3 s that `kgcp detect` does not need
@@ -305,9 +305,8 @@ def read_settings(path: Path) -> DetectSettings:
     try:
         values = json.loads(text)
         known = {field.name for field in fields(DetectSettings)} & values.keys()
-        settings = DetectSettings(**{name: values[name] for name in known})
-        return replace(settings, method=Method(settings.method))
-    except (AttributeError, TypeError, ValueError, RecursionError) as error:
+        return DetectSettings(**{name: values[name] for name in known})
+    except (AttributeError, KgcpError, TypeError, ValueError, RecursionError) as error:
         raise KgcpError(
             f"{path}: its settings are not of this version of kgcp ({error});"
             " run 'kgcp detect' on this flight again"
