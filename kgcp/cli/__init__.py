@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import atexit
+import errno
 import gc
 import io
+import os
 import sys
 import time
 import warnings
@@ -69,6 +71,22 @@ def _one_line_warnings() -> Iterator[None]:
         yield
 
 
+def _open_all_streams() -> None:
+    """Let streams that are closed swallow what is printed, as services and `2>&-` leave them.
+
+    Otherwise the next file that is opened takes the stream's number, and with it what libraries
+    print.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # noqa: FBT003 - gets the number
+        if getattr(sys, name) is None:
+            mode = "r" if name == "stdin" else "w"
+            setattr(sys, name, open(number, mode, encoding="utf-8", closefd=False))  # noqa: SIM115 - to the end
+
+
 def _print_anything() -> None:
     """Let streams replace characters that they cannot print, as the arrows on Windows' code pages.
 
@@ -84,6 +102,7 @@ class Program(click.Group):
 
     def main(self, *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401 - click's signature
         """Run the program; even its help has characters that not every stream can print."""
+        _open_all_streams()
         _print_anything()
         gc.set_threshold(_OBJECTS)
         atexit.register(gc.freeze)  # 0.2 s of searching what ends with the process anyway
@@ -112,13 +131,17 @@ class Program(click.Group):
                 ]
             )
 
-    def _is_option(self, ctx: click.Context, error: KgcpError) -> bool:
-        """Whether an error begins with the name of an option of the command that was called."""
+    def _in_options(self, ctx: click.Context, error: KgcpError) -> str:
+        """Return the text of an error; a setting has the name of the option that it came from."""
+        text = error.on_command_line()
         command = self.get_command(ctx, ctx.invoked_subcommand or "")
         if command is None or not isinstance(error, SettingError):
-            return False
+            return text
         option = f"--{error.key.replace('_', '-')}"
-        return any(option in parameter.opts for parameter in command.params)
+        for parameter in command.params:
+            if option in parameter.opts or parameter.name == error.key:
+                return text.replace(error.key, parameter.opts[0], 1)
+        return text
 
     def invoke(self, ctx: click.Context) -> object:
         """Run a command; unexpected exceptions keep their traceback."""
@@ -127,8 +150,14 @@ class Program(click.Group):
             with _one_line_warnings():
                 return super().invoke(ctx)
         except KgcpError as error:
-            dashes = "--" if self._is_option(ctx, error) else ""
-            click.echo(f"kgcp: error: {dashes}{error.on_command_line()}", err=True)
+            click.echo(f"kgcp: error: {self._in_options(ctx, error)}", err=True)
+            ctx.exit(_EXIT_KNOWN_ERROR)
+        except OSError as error:
+            if error.errno != errno.ENOSPC:
+                raise
+            where = "" if error.filename is None else f"{error.filename}: "
+            text = f"kgcp: error: {where}no space left; make room, then repeat the command"
+            click.echo(text, err=True)
             ctx.exit(_EXIT_KNOWN_ERROR)
         except KeyboardInterrupt:
             click.echo("kgcp: interrupted; files written so far are complete", err=True)

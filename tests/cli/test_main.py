@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import re
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from click.testing import CliRunner
 from kgcp import __version__
 from kgcp.cli import COMMANDS, Program, main
 from kgcp.errors import KgcpError, KgcpWarning
+from tests.cli.conftest import SampleFlight
 
 HEAVY = {"cv2", "jinja2", "matplotlib", "numpy", "pandas", "PIL", "pyarrow", "pyproj", "scipy"}
 
@@ -112,6 +114,37 @@ def test_an_error_of_an_option_begins_with_its_dashes(tmp_path: Path) -> None:
     result = CliRunner().invoke(main, [*arguments, "--out", str(tmp_path)])
     assert result.stderr.startswith("kgcp: error: --sheet: 'T1' needs 1145 × ")
     assert result.exit_code == 1
+
+
+@pytest.mark.parametrize("option", ["--max-sd", "--min-spacing", "--min-score"])
+def test_what_is_no_number_is_an_error_of_the_option(tmp_path: Path, option: str) -> None:
+    result = CliRunner().invoke(main, ["export-gcp", str(tmp_path), option, "nan"])
+    assert re.match(rf"kgcp: error: {option}: nan( m)? is out of range; ", result.stderr)
+    assert result.exit_code == 1
+
+
+@pytest.mark.parametrize("path", [None, "results/run.json"])
+def test_a_full_disk_is_one_line(path: str | None) -> None:
+    code, _, stderr = run_raising(OSError(errno.ENOSPC, "No space left on device", path))
+    where = "" if path is None else f"{path}: "
+    assert stderr == f"kgcp: error: {where}no space left; make room, then repeat the command\n"
+    assert code == 1
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Popen closes no streams there")
+@pytest.mark.parametrize("closed", [(2,), (1, 2), (0, 1, 2)])
+def test_streams_that_are_closed_swallow_what_is_printed(
+    unmeasured: SampleFlight, closed: tuple[int, ...]
+) -> None:
+    call = ["-m", "kgcp", "detect", str(unmeasured.path), "--jobs", "1"]
+    program = (
+        "import os, sys\n"
+        f"for number in {closed}: os.close(number)\n"
+        f"os.execv(sys.executable, [sys.executable, *{call}])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], check=False)
+    assert done.returncode == 0
+    assert (unmeasured.out / "detections.parquet").is_file()
 
 
 def test_the_module_runs_and_knows_its_version() -> None:
