@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from kgcp.simulation.outlook import Outlook
 
 _WIDE = 50.0  # spans of deviations from which only powers of ten are numbered
 _LABEL_SHARE = 0.075  # of the axis, that a height's label takes
+_TITLE_LETTERS = 48  # of one line
 _METADATA: dict[str, dict[str, str | None]] = {
     ".png": {"Software": None},
     ".svg": {"Date": None, "Creator": None},
@@ -47,7 +49,8 @@ def write_plan_figure(outlooks: Sequence[Outlook], title: str, path: Path) -> No
     stream = io.BytesIO()
     with sheet(9.6) as figure:
         panels = figure.subplots(4, 1, sharex=True)
-        figure.suptitle(title, fontsize=12)
+        lines = textwrap.fill(title, _TITLE_LETTERS)
+        figure.suptitle(lines, fontsize=12, parse_math=False)  # names may have dollars
         for draw, axes in zip(
             (_draw_distance, _draw_centre, _draw_found, _draw_ground), panels, strict=True
         ):

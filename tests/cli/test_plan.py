@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -110,6 +111,20 @@ def test_the_figure_is_drawn(flight: Path) -> None:
     with Image.open(path) as picture:
         assert picture.convert("L").getextrema() == (0, 255)
         assert picture.width > 1000
+
+
+def test_a_name_is_drawn_as_it_is_however_long(flight: Path) -> None:
+    toml = (flight / "flight.toml").read_text(encoding="utf-8")
+    name = "$\\frac{$ " + "roof " * 20
+    assert toml.count('name = "A"') == 1
+    text = toml.replace('name = "A"', f"name = '{name}'")
+    (flight / "flight.toml").write_text(text, encoding="utf-8")
+    path = flight / "plan.svg"
+    result = run(flight, "--plot", path)
+    assert result.exit_code == 0, result.output
+    lines = re.findall(r"<!-- (.*(?:Target|roof).*) -->", path.read_text(encoding="utf-8"))
+    assert " ".join(lines) == f"Target {name.strip()}"
+    assert max(map(len, lines)) < 50
 
 
 def test_the_same_plan_is_the_same_figure(flight: Path) -> None:
