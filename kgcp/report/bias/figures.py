@@ -21,6 +21,7 @@ from kgcp.report.style import BLUE, GREEN, GREY, VERMILION, Picture, Points, pic
 
 WINDOW_M = 10.0  # of the paper's Figure 9
 _SIGNED = "PuOr"  # orange and violet: distinct to all kinds of colour vision
+_WIDE = 4.0  # span of radii from which on an axis of powers of two has at least two of them
 _BINS = [0.5 * step - 5.25 for step in range(22)]
 
 _FULL_SCALE = 255.0  # of grey values
@@ -333,25 +334,27 @@ def change_by_reexposure(results: Sequence[Reexposed]) -> Picture:
             kept = [result for result in of_gain if result.change_percent is not None]
             lost = [result for result in of_gain if result.change_percent is None]
             label = f"grey × {gain:g}"
-            points.append(_changes(axes, kept, colours[gain], label))
+            if kept:
+                marker = "v" if gain < 1.0 else "^"  # both are seen where the changes agree
+                points.append(_changes(axes, kept, colours[gain], marker, label))
             if lost:
                 x = np.array([result.radius_px for result in lost])
                 axes.plot(x, np.zeros(len(x)), "x", color=colours[gain], label=f"{label}: lost")
-        axes.set_xscale("log", base=2)
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value:.0f}")
+        radii = [result.radius_px for result in results]
+        if max(radii) > _WIDE * min(radii):
+            axes.set_xscale("log", base=2)
+            axes.xaxis.set_major_formatter(lambda value, _: f"{value:.0f}")
         axes.set_xlabel("radius of the ring [px]")
         axes.set_ylabel("change of distance [%]")
         axes.legend(loc="best")
-        return picture(figure, [panel for panel in points if panel.rows.size])
+        return picture(figure, points)
 
 
-def _changes(axes: Axes, kept: Sequence[Reexposed], colour: str, label: str) -> Points:
+def _changes(axes: Axes, kept: Sequence[Reexposed], colour: str, marker: str, label: str) -> Points:
     x = np.array([result.radius_px for result in kept])
     y = np.array([result.change_percent for result in kept], dtype=np.float64)
     sd = np.array([result.sd_percent or 0.0 for result in kept])
-    axes.errorbar(
-        x, y, yerr=sd, fmt="o", color=colour, ecolor=colour, elinewidth=1.0, capsize=3, label=label
-    )
+    axes.errorbar(x, y, yerr=sd, fmt=marker, color=colour, elinewidth=1.0, capsize=3, label=label)
     return Points(axes, np.array([result.row for result in kept], dtype=np.intp), x, y)
 
 

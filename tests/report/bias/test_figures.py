@@ -1,0 +1,54 @@
+"""What the figures show where there is little to draw."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from kgcp.report.bias.figures import change_by_reexposure
+from kgcp.report.bias.reexposure import Reexposed
+from kgcp.report.style import Picture, Points, picture
+
+
+def drawn(monkeypatch: pytest.MonkeyPatch, results: Sequence[Reexposed]) -> Axes:
+    """Return the panel of the changes by exposure, as it is drawn."""
+    axes: list[Axes] = []
+
+    def keep(figure: Figure, points: Sequence[Points] = ()) -> Picture:
+        shown = picture(figure, points)
+        axes.extend(figure.axes)
+        return shown
+
+    monkeypatch.setattr("kgcp.report.bias.figures.picture", keep)
+    change_by_reexposure(results)
+    (panel,) = axes
+    return panel
+
+
+def again(gain: float, radius_px: float, change_percent: float | None = 0.01) -> Reexposed:
+    return Reexposed(0, gain, radius_px, change_percent, 0.02, 0.0)
+
+
+@pytest.mark.parametrize("radii", [(22.0,), (33.0, 60.0), (17.0, 69.0), (9.0, 93.0)])
+def test_radii_are_numbered_however_close_they_are(
+    monkeypatch: pytest.MonkeyPatch, radii: tuple[float, ...]
+) -> None:
+    panel = drawn(monkeypatch, [again(gain, radius) for radius in radii for gain in (0.6, 1.6)])
+    low, high = panel.get_xlim()
+    labels = zip(panel.get_xticks(), panel.get_xticklabels(), strict=True)
+    assert sum(low <= tick <= high and bool(label.get_text()) for tick, label in labels) >= 2
+
+
+def test_the_legend_has_what_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    panel = drawn(monkeypatch, [again(0.6, 22.0), again(1.6, 22.0, None)])
+    _, labels = panel.get_legend_handles_labels()
+    assert sorted(labels) == ["grey × 0.6", "grey × 1.6: lost"]
+
+
+def test_equal_changes_are_both_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    panel = drawn(monkeypatch, [again(0.6, 22.0), again(1.6, 22.0)])
+    markers = {line.get_marker() for line in panel.get_lines()}
+    assert {"v", "^"} <= markers
