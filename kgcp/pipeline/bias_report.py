@@ -157,14 +157,14 @@ class FlightBias:
                     " the trajectory put the target; check [reference] poses, [vehicle] trajectory"
                     " and crs"
                 )
-        table = folder / "bias.parquet"
-        rows = (bias_row(pair, study.method) for pair in study.measured)
-        write_table(table, BIAS_COLUMNS, rows, self.provenance)
         content = self._content(stored_frames or flight.frames_folder, reexpose)
         files = {FIGURE_FILES[name]: figure.png for name, figure in content.pictures.items()}
         text = json.dumps(finite(content.summary), indent=1, allow_nan=False)
         files["bias_summary.json"] = f"{text}\n".encode()
         files["bias_report.html"] = render_page(content).encode()
+        table = folder / "bias.parquet"
+        rows = (bias_row(pair, study.method) for pair in study.measured)
+        write_table(table, BIAS_COLUMNS, rows, self.provenance)
         for name, data in files.items():
             write_bytes(folder / name, data)
         for name in set(FIGURE_FILES.values()) - files.keys():

@@ -279,6 +279,21 @@ def test_without_frames_there_is_a_page_too(compare: Compare, study: Study, tmp_
     assert not (tmp_path / "bias_reexposure.png").exists()
 
 
+def test_an_interrupted_report_leaves_that_of_the_run_before(
+    compare: Compare, study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    of_sample(study(compare(30.0, 0.1))).write_report(tmp_path, reexpose=0)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("kgcp.pipeline.bias_report.draw_figures", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        of_sample(study(compare(40.0, 0.2))).write_report(tmp_path, reexpose=0)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
 def test_without_times_deviations_or_poses_there_is_a_page_too(
     compare: Compare, study: Study, tmp_path: Path
 ) -> None:
