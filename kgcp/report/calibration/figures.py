@@ -207,7 +207,10 @@ def _draw_displacement(axes: Axes, camera: Camera, radius_px: float) -> None:
     axes.plot(*places.T, ".", color=GREY, markersize=3.0)
     _frame(axes, camera.width, camera.height)
     axes.grid(visible=False)
-    axes.set_xlabel(f"distortion within discs of R = {radius_px:.0f} px: longest {largest:.3f} px")
+    axes.set_xlabel(
+        f"x [px]   (distortion in discs of R {radius_px:.0f} px: up to {largest:.3f} px)"
+    )
+    axes.set_ylabel("y [px]")
 
 
 def _arrows(

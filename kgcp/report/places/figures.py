@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from matplotlib.axes import Axes
 
@@ -12,6 +14,9 @@ from kgcp.report.style import BLUE, GREEN, GREY, VERMILION, Picture, picture, sh
 _COLOURS = {"x": BLUE, "y": VERMILION, "z": GREEN}
 _EXPECTED_CHI2 = 5.0  # five numbers of a frame
 _MM = 1e3
+_NAME_LETTERS = 16  # of a name; the page's tables have all
+_LINE_LETTERS = 26  # of names side by side
+_MOST_NAMES = 25  # upright ones
 
 
 def draw_places(placed: tuple[PlacedTarget, ...]) -> dict[str, bytes]:
@@ -34,14 +39,23 @@ def _diameters(placed: tuple[PlacedTarget, ...]) -> Picture:
         axes = figure.subplots()
         axes.axhline(0.0, color="black", linewidth=0.8)
         axes.errorbar(places, off, yerr=2.0 * np.array(sd), fmt="o", color=BLUE, capsize=4.0)
-        _name_ticks(axes, places, [target.target for target in placed])
+        name_ticks(axes, places, [target.target for target in placed])
         axes.set_xlim(-0.5, len(placed) - 0.5)
         axes.set_ylabel("diameter: placed − stated [‰]")
         return picture(figure)
 
 
-def _name_ticks(axes: Axes, places: FloatArray | IndexArray, names: list[str]) -> None:
-    axes.set_xticks(places, names, parse_math=False)  # names may have dollars
+def _shortened(name: str) -> str:
+    return name if len(name) <= _NAME_LETTERS else f"{name[: _NAME_LETTERS - 1]}…"
+
+
+def name_ticks(axes: Axes, places: FloatArray | IndexArray, names: list[str]) -> None:
+    """Write names below their places: upright if they fill the line, not all if they are many."""
+    shown = slice(None, None, math.ceil(len(names) / _MOST_NAMES))
+    texts = [_shortened(name) for name in names[shown]]
+    is_upright = max(map(len, texts)) * len(texts) > _LINE_LETTERS
+    rotation = 90.0 if is_upright else 0.0
+    axes.set_xticks(places[shown], texts, parse_math=False, rotation=rotation)  # may have dollars
 
 
 def _positions(placed: tuple[PlacedTarget, ...]) -> Picture:
@@ -57,7 +71,7 @@ def _positions(placed: tuple[PlacedTarget, ...]) -> Picture:
             axes.errorbar(
                 places, off, yerr=2.0 * sd, fmt="o", color=colour, capsize=4.0, label=name
             )
-        _name_ticks(axes, np.arange(len(stated)), [target.target for target in stated])
+        name_ticks(axes, np.arange(len(stated)), [target.target for target in stated])
         axes.set_xlim(-0.5, len(stated) - 0.5)
         axes.set_ylabel("place: placed − stated [mm]")
         axes.legend(ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
@@ -88,7 +102,7 @@ def _frames(placed: tuple[PlacedTarget, ...]) -> Picture:
             middles.append(rows.mean())
             first += len(rows) + 1
         axes.set_yscale("log")
-        _name_ticks(axes, np.array(middles), [target.target for target in placed])
+        name_ticks(axes, np.array(middles), [target.target for target in placed])
         axes.set_xlabel("frames, target by target (×: left out)")
         axes.set_ylabel("χ² of five numbers")
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))
