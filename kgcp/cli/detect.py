@@ -214,6 +214,6 @@ def command(
     seconds = time.perf_counter() - start
     report(summary, workspace.named(summary.table), overlay, seconds, log, as_json=as_json)
     if is_profiled:
-        report_stages(summary, start - STARTED_S, time.perf_counter() - STARTED_S)
+        report_stages(summary, start - STARTED_S, time.perf_counter() - STARTED_S, log)
     if summary.problem is not None:
         raise KgcpError(summary.problem)

@@ -189,8 +189,8 @@ def report(
         click.echo(f"wrote {' and '.join(files.values())}", err=True)
 
 
-def report_stages(summary: DetectionSummary, before_s: float, total_s: float) -> None:
-    """Print the time per stage.
+def report_stages(summary: DetectionSummary, before_s: float, total_s: float, log: Log) -> None:
+    """Print the time per stage, on request even of a quiet run.
 
     Parameters
     ----------
@@ -200,6 +200,9 @@ def report_stages(summary: DetectionSummary, before_s: float, total_s: float) ->
         From the start of the program to now [s].
     """
     stages_s = {"loading libraries, checking the flight": before_s, **summary.stages_s}
+    if log.is_json:
+        log.event("stages", stages_s={**stages_s, "in all": total_s})
+        return
     for stage, seconds in stages_s.items():
         if seconds >= _SHORTEST_STAGE_S:
             click.echo(f"{seconds:10.3f} s  {stage}", err=True)

@@ -124,10 +124,11 @@ def test_what_is_said_can_be_chosen(short_flight: Path, tmp_path: Path) -> None:
     assert quiet.exit_code == 1
     assert quiet.output.startswith("kgcp: error: no target was measured in any of 4 frames: ")
     assert quiet.output.count("\n") == 1
-    told = run(short_flight, tmp_path / "b", "--log-json", "--restart", "--json")
+    told = run(short_flight, tmp_path / "b", "--log-json", "--restart", "--json", "--profile")
     events = [json.loads(line) for line in told.stderr.splitlines()[:-1]]
-    assert [event["event"] for event in events[-2:]] == ["progress", "summary"]
-    assert events[-1]["reasons"] == json.loads(told.stdout)["reasons"]
+    assert [event["event"] for event in events[-3:]] == ["progress", "summary", "stages"]
+    assert events[-1]["stages_s"]["in all"] > events[-1]["stages_s"]["first look"] > 0.0
+    assert events[-2]["reasons"] == json.loads(told.stdout)["reasons"]
     profiled = run(short_flight, tmp_path / "c", "--profile")
     for stage in ("first look", "table", "workers: io.images.frames.read_grey"):
         assert f" s  {stage}\n" in profiled.stderr
