@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import cache
+from threading import Lock
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -33,18 +34,45 @@ def use_one_thread_each() -> None:
 def single_threaded() -> Iterator[None]:
     """Keep BLAS, LAPACK and OpenCV on one thread until the block ends, then restore their threads.
 
-    It also holds in a program that has loaded the libraries before it calls kgcp. As a decorator,
-    `@single_threaded()`, it serves a function; a generator it would not.
+    It also holds in a program that has loaded the libraries before it calls kgcp, and for calls
+    from several threads, the last of which restores. As a decorator, `@single_threaded()`, it
+    serves a function; a generator it would not.
     """
-    import cv2
-
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(0)
+    _LIMIT.enter()
     try:
-        with _controller().limit(limits=1):
-            yield
+        yield
     finally:
-        cv2.setNumThreads(threads)
+        _LIMIT.leave()
+
+
+class _Limit:
+    """The limit of a process, which has one number of threads for all blocks that are at work."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._blocks = 0
+        self._undo = ExitStack()
+
+    def enter(self) -> None:
+        """Limit the libraries, unless another block has done so."""
+        import cv2
+
+        with self._lock:
+            if self._blocks == 0:
+                self._undo.callback(cv2.setNumThreads, cv2.getNumThreads())
+                cv2.setNumThreads(0)
+                self._undo.enter_context(_controller().limit(limits=1))
+            self._blocks += 1
+
+    def leave(self) -> None:
+        """Restore the libraries, unless another block is still at work."""
+        with self._lock:
+            self._blocks -= 1
+            if self._blocks == 0:
+                self._undo.close()
+
+
+_LIMIT = _Limit()
 
 
 @cache
