@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
+from threading import Lock
 
 import cv2
 import numpy as np
@@ -55,6 +56,7 @@ _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 
 # libjpeg's words for data that it had to guess; it decodes on and only mentions it on stderr.
 _GUESSED_PIXELS = ("Corrupt JPEG data", "Premature end of JPEG file")
+_STDERR = Lock()  # which a process has but once
 
 
 def list_frames(folder: Path, remedy: str = CORRECT_FOLDER) -> list[str]:
@@ -251,12 +253,13 @@ def _collected_stderr() -> Iterator[list[str]]:
     """Collect what libraries write to the process's stderr, as lines, until the block ends.
 
     The image decoders below OpenCV report damage in no other way. The whole process is
-    affected, so the block must be short and the process must not have other busy threads.
+    affected, so the block must be short, and threads enter it one after the other: else one would
+    restore the other's file as stderr.
     """
     messages: list[str] = []
-    sys.stderr.flush()
-    stderr = os.dup(2)
-    with tempfile.TemporaryFile() as sink:
+    with _STDERR, tempfile.TemporaryFile() as sink:
+        sys.stderr.flush()
+        stderr = os.dup(2)
         os.dup2(sink.fileno(), 2)
         try:
             yield messages

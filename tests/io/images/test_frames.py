@@ -3,6 +3,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -204,3 +205,23 @@ except Rejection as rejection:
         caught = rejection(path)
         assert caught.reason is Reason.WRONG_SIZE
         assert caught.detail == f"{shape[1]} x {shape[0]} px, the camera has {WIDTH} x {HEIGHT}"
+
+
+def test_threads_keep_each_other_s_damage_and_stderr_apart(tmp_path: Path) -> None:
+    whole, damaged = tmp_path / "whole.jpg", tmp_path / "damaged.jpg"
+    content = encoded(textured(), ".jpg")
+    middle = len(content) // 2
+    whole.write_bytes(content)
+    damaged.write_bytes(content[:middle] + bytes(200) + content[middle + 200 :])
+    stderr = os.fstat(2).st_ino
+
+    def is_read(path: Path) -> bool:
+        try:
+            return read_grey(path, CAMERA).shape == (HEIGHT, WIDTH)
+        except Rejection:
+            return False
+
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(is_read, [whole, damaged] * 200))
+    assert found == [True, False] * 200
+    assert os.fstat(2).st_ino == stderr
