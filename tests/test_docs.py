@@ -18,6 +18,7 @@ from kgcp.io.flight.flight import FRAMES_KEYS, REFERENCE_KEYS
 from kgcp.io.flight.target_table import PLAIN_KEYS, PLATE_KEYS, REPLICA_KEYS
 from kgcp.io.flight.vehicle_table import VEHICLE_KEYS
 from kgcp.io.formats import calibrations, frame_times, orientations, trajectories
+from kgcp.io.tables.calibration import FIELD_COLUMNS, OBSERVATION_COLUMNS, PHOTO_COLUMNS
 from kgcp.io.tables.columns import Column
 from kgcp.io.tables.consistency import CONSISTENCY_COLUMNS
 from kgcp.io.tables.detections import DETECTION_COLUMNS
@@ -86,6 +87,9 @@ def first_column(text: str) -> list[str]:
         ("poses.parquet", POSE_COLUMNS),
         ("pose_residuals.parquet", POSE_RESIDUAL_COLUMNS),
         ("place_residuals.parquet", PLACE_RESIDUAL_COLUMNS),
+        ("photos.parquet", PHOTO_COLUMNS),
+        ("observations.parquet", OBSERVATION_COLUMNS),
+        ("field.parquet", FIELD_COLUMNS),
     ],
 )
 def test_exactly_the_columns_that_exist_are_documented(

@@ -26,6 +26,7 @@ from kgcp.network.calibration_records import LensModel, PointModel
 from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, photograph
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.targets.fields.layout import Field, GridKind, Mark
+from tests.test_docs import first_column, section
 
 CAMERA = Camera(400, 300, 390.0, 390.0, 204.2, 146.5, -0.08, response=Response.LINEAR)
 FIELD = Field("f", GridKind.SQUARE, 5, 4, 0.03, 0.016, marks=(Mark(1, 1, 0.016, 0.007),))
@@ -127,6 +128,11 @@ def test_every_photograph_has_its_row(calibration: tuple[Path, Result]) -> None:
         *("camera.toml", "field.toml", "field.csv", "calibration.json", "calibration.html"),
         *("observations.parquet", "field.parquet", "photos.parquet", "opencv.yml"),
     }
+
+
+def test_exactly_the_numbers_that_exist_are_documented(calibration: tuple[Path, Result]) -> None:
+    numbers = json.loads((calibration[0] / "calibration.json").read_text(encoding="utf-8"))
+    assert numbers.keys() | {"against"} == set(first_column(section("calibration.json")))
 
 
 def test_the_page_is_self_contained_and_complete(calibration: tuple[Path, Result]) -> None:

@@ -25,6 +25,7 @@ from kgcp.pipeline.bias_report import FIGURE_FILES, FlightBias
 from kgcp.quality.bias_study import BiasStudy, Comparison, ReferenceSds
 from kgcp.quality.learnt_imaging import LearntImaging
 from kgcp.settings import DetectSettings
+from tests.test_docs import first_column, section
 
 Compare = Callable[..., Comparison]
 Study = Callable[..., BiasStudy]
@@ -268,6 +269,11 @@ def test_names_of_files_are_text_in_the_page(made: Made) -> None:
     assert "alert(1)</script>" not in text
     assert "http://" not in text.replace("http://www.w3.org/2000/svg", "")
     assert "https://" not in text
+
+
+def test_exactly_the_numbers_that_exist_are_documented(made: Made) -> None:
+    summary = json.loads((made.folder / "bias_summary.json").read_text(encoding="utf-8"))
+    assert summary.keys() == set(first_column(section("bias_summary.json")))
 
 
 def test_without_frames_there_is_a_page_too(compare: Compare, study: Study, tmp_path: Path) -> None:
