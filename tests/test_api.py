@@ -15,6 +15,7 @@ import pytest
 
 import kgcp
 from kgcp.geometry.camera import Response
+from kgcp.io.exporters.points import MapPoints
 from kgcp.settings import Method
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -132,6 +133,12 @@ def test_the_method_is_taken_as_a_word() -> None:
 def test_wrong_arguments_are_named(make: Callable[[], object], problem: str) -> None:
     with pytest.raises(kgcp.KgcpError, match=problem):
         make()
+
+
+@pytest.mark.parametrize("floor_px", [np.nan, -1.0])
+def test_a_floor_of_marks_that_cannot_be_is_not_written(floor_px: float) -> None:
+    with pytest.raises(kgcp.KgcpError, match=r"mark_floor_px: .* px is out of range"):
+        MapPoints("EPSG:25832", (), CAMERA, mark_floor_px=floor_px)
 
 
 def test_targets_may_come_one_by_one() -> None:

@@ -11,6 +11,7 @@ import click
 from kgcp.cli import STARTED_S
 from kgcp.cli.detect_log import log_to_stderr, report, report_stages, stopping
 from kgcp.cli.options import (
+    NumberRange,
     flight_place_argument,
     json_option,
     log_json_option,
@@ -111,7 +112,7 @@ _DEFAULTS = DetectSettings()
 @restart_option
 @click.option(
     "--frame-timeout",
-    type=click.FloatRange(1.0),
+    type=NumberRange(1.0),
     metavar="S",
     default=300.0,
     show_default=True,

@@ -12,6 +12,7 @@ import click
 
 from kgcp.cli.doubts import doubt_json, print_doubts
 from kgcp.cli.options import (
+    NumberRange,
     detections_option,
     flight_places_argument,
     json_option,
@@ -73,7 +74,7 @@ def _list_formats(context: click.Context, _: click.Parameter, asked: bool) -> No
 @click.option(
     "--mark-floor-px",
     metavar="PX",
-    type=click.FloatRange(0.0, 100.0),
+    type=NumberRange(0.0, 100.0),
     default=0.1,
     show_default=True,
     help="Least standard deviation of an image point in the files of other programs [px].",

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from kgcp.cli.options import flight_argument, json_option
+from kgcp.cli.options import NumberRange, flight_argument, json_option
 
 if TYPE_CHECKING:
     from kgcp.pipeline.init import FlightDraft
@@ -29,7 +29,7 @@ _WIDTH = 100
     "--diameter",
     "diameter_m",
     metavar="M",
-    type=click.FloatRange(0.0, 100.0, min_open=True),
+    type=NumberRange(0.0, 100.0, min_open=True),
     help="Outer diameter of the targets that --code describes [m].",
 )
 @click.option(

@@ -26,6 +26,7 @@ selection_options : the fields of `kgcp.georef.selection.Selection`
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -105,31 +106,48 @@ json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print a machine-readable summary to stdout."
 )
 
+
+class NumberRange(click.FloatRange):
+    """A number within bounds: not NaN, which is neither below nor above any."""
+
+    def convert(
+        self,
+        value: Any,  # noqa: ANN401 - click's signature
+        param: click.Parameter | None,
+        ctx: click.Context | None,
+    ) -> float:
+        """Return the number of a text, or end with wrong usage."""
+        number = float(super().convert(value, param, ctx))
+        if math.isnan(number):
+            self.fail(f"{value} is not a number.", param, ctx)
+        return number
+
+
 _SELECTION = (
     click.option(
         "--max-sd",
         "max_sd_m",
         metavar="M",
-        type=click.FloatRange(0.0, min_open=True),
+        type=NumberRange(0.0, min_open=True),
         help="Leave out points with a larger standard deviation along their worst axis [m].",
     ),
     click.option(
         "--min-score",
         metavar="S",
-        type=click.FloatRange(0.0, 1.0),
+        type=NumberRange(0.0, 1.0),
         help="Leave out points whose code matched less well than this score.",
     ),
     click.option(
         "--min-ambiguity",
         metavar="A",
-        type=click.FloatRange(0.0),
+        type=NumberRange(0.0),
         help="Leave out points whose two poses are harder to tell apart than this Δχ².",
     ),
     click.option(
         "--min-spacing",
         "min_spacing_m",
         metavar="M",
-        type=click.FloatRange(0.0),
+        type=NumberRange(0.0),
         default=0.0,
         help="Thin points to this spacing along the track, keeping the best [m].",
     ),
@@ -137,7 +155,7 @@ _SELECTION = (
         "--checkpoints",
         "checkpoint_share",
         metavar="SHARE",
-        type=click.FloatRange(0.0, 1.0),
+        type=NumberRange(0.0, 1.0),
         default=0.0,
         help="Declare this share of the points check points, spaced evenly along the track.",
     ),

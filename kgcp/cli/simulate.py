@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from kgcp.cli.options import json_option
+from kgcp.cli.options import NumberRange, json_option
 
 if TYPE_CHECKING:
     from kgcp.simulation.presets import SimulationSettings
@@ -62,14 +62,14 @@ PRESET_NAMES = (
 )
 @click.option(
     "--gain",
-    type=(click.FloatRange(0.01, 100.0), click.FloatRange(0.01, 100.0)),
+    type=(NumberRange(0.01, 100.0), NumberRange(0.01, 100.0)),
     metavar="MIN MAX",
     help="Range of the exposure; at 1, a perfectly white plate reaches full scale, and beyond it is"
     " burnt.",
 )
 @click.option(
     "--shadow",
-    type=click.FloatRange(0.0, 1.0),
+    type=NumberRange(0.0, 1.0),
     help="Cast a shadow edge across the plates; this share of the light is left in it.",
 )
 @click.option(
@@ -79,34 +79,34 @@ PRESET_NAMES = (
 )
 @click.option(
     "--dirt",
-    type=click.FloatRange(0.0, 0.5),
+    type=NumberRange(0.0, 0.5),
     help="Vary the plates' reflectance by this relative standard deviation.",
 )
 @click.option("--stains", type=click.IntRange(0, 1000), help="Put this many stains on the plates.")
 @click.option(
     "--glare",
-    type=click.FloatRange(0.0, 10.0),
+    type=NumberRange(0.0, 10.0),
     help="Add highlights to the plates: peaks of up to this share of full scale.",
 )
 @click.option(
     "--astigmatism",
-    type=click.FloatRange(1.0, 5.0),
+    type=NumberRange(1.0, 5.0),
     help="Make the point spread elliptic: the ratio of its axes.",
 )
 @click.option(
     "--coma",
-    type=click.FloatRange(0.0, 0.5),
+    type=NumberRange(0.0, 0.5),
     help="Give the point spread a tail: its third moment over the cube of its sigma.",
 )
 @click.option(
     "--defocus",
-    type=click.FloatRange(0.0, 10.0),
+    type=NumberRange(0.0, 10.0),
     metavar="PX",
     help="Put the lens out of focus: the radius of the disc that a point becomes.",
 )
 @click.option(
     "--sharpening",
-    type=(click.FloatRange(0.0, 10.0), click.FloatRange(0.1, 10.0)),
+    type=(NumberRange(0.0, 10.0), NumberRange(0.1, 10.0)),
     metavar="STRENGTH PX",
     help="Sharpen frames by an unsharp mask of this strength and sigma.",
 )
@@ -118,7 +118,7 @@ PRESET_NAMES = (
 )
 @click.option(
     "--rolling",
-    type=click.FloatRange(0.0, 10.0),
+    type=NumberRange(0.0, 10.0),
     metavar="SECONDS",
     help="Expose rows one after the other, the last this long after the first.",
 )

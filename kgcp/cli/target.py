@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 from click.core import ParameterSource
 
-from kgcp.cli.options import json_option, unit_option
+from kgcp.cli.options import NumberRange, json_option, unit_option
 
 if TYPE_CHECKING:
     from kgcp.targets.layout import Target
@@ -54,7 +54,7 @@ PAPERS = ("fit", "A4", "A3", "A2", "A1", "A0")
     "--diameter",
     "diameter_m",
     metavar="M",
-    type=click.FloatRange(0.0, 100.0, min_open=True),
+    type=NumberRange(0.0, 100.0, min_open=True),
     help="Outer diameter of new targets [m].  [default: that of FLIGHT's first target]",
 )
 @click.option(
@@ -88,7 +88,7 @@ PAPERS = ("fit", "A4", "A3", "A2", "A1", "A0")
     "--plate",
     "plate_m",
     metavar="M",
-    type=click.FloatRange(0.0, 100.0, min_open=True),
+    type=NumberRange(0.0, 100.0, min_open=True),
     help="Draw the outline of a square plate of this width [m].",
 )
 @click.option("--round", "is_round", is_flag=True, help="Make the plate round.")
@@ -96,7 +96,7 @@ PAPERS = ("fit", "A4", "A3", "A2", "A1", "A0")
     "--holes",
     "hole_mm",
     metavar="MM",
-    type=click.FloatRange(0.0, 1000.0, min_open=True),
+    type=NumberRange(0.0, 1000.0, min_open=True),
     help="Mark four mounting holes of this diameter on the plate [mm].",
 )
 @click.option(

@@ -116,10 +116,16 @@ def test_an_error_of_an_option_begins_with_its_dashes(tmp_path: Path) -> None:
     assert result.exit_code == 1
 
 
-@pytest.mark.parametrize("option", ["--max-sd", "--min-spacing", "--min-score"])
-def test_what_is_no_number_is_an_error_of_the_option(tmp_path: Path, option: str) -> None:
+@pytest.mark.parametrize("option", ["--max-sd", "--mark-floor-px"])
+def test_what_is_no_number_is_wrong_usage(tmp_path: Path, option: str) -> None:
     result = CliRunner().invoke(main, ["export-gcp", str(tmp_path), option, "nan"])
-    assert re.match(rf"kgcp: error: {option}: nan( m)? is out of range; ", result.stderr)
+    assert result.stderr.endswith(f"Error: Invalid value for '{option}': nan is not a number.\n")
+    assert result.exit_code == 2
+
+
+def test_an_error_names_the_option_as_it_is_written(tmp_path: Path) -> None:
+    result = CliRunner().invoke(main, ["detect", str(tmp_path), "--jobs", "0", "--min-score", "2"])
+    assert result.stderr.startswith("kgcp: error: --min-score: 2 is out of range; ")
     assert result.exit_code == 1
 
 

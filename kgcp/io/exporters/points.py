@@ -21,6 +21,7 @@ from kgcp.georef.crs import is_geographic
 from kgcp.georef.gcp import Gcp
 from kgcp.io.exporters.weights import MARK_FLOOR_PX
 from kgcp.io.files.csv_text import DEGREE_DECIMALS
+from kgcp.settings import require_range
 
 Cell = TypeVar("Cell", str, float)
 
@@ -47,6 +48,9 @@ class MapPoints:
     # whether names of images end in their extension, for formats whose users may have removed it
     image_extensions: bool = True
     is_one_camera: bool = True  # whether `camera` has seen all points, not only those of a flight
+
+    def __post_init__(self) -> None:
+        require_range("mark_floor_px", self.mark_floor_px, 0.0, 100.0, unit="px")
 
     @property
     def parsed_crs(self) -> CRS:
