@@ -167,7 +167,8 @@ def standardised_histogram(numbers: BiasNumbers) -> Picture:
         axes.plot(x, normal, "--", color="black", linewidth=1.5, label="normal, sd 1")
         axes.set_xlabel("error / reported standard deviation  (ends: and beyond)")
         axes.set_ylabel("density")
-        axes.legend(loc="upper right")
+        drawn = axes.get_legend_handles_labels()
+        figure.legend(*drawn, loc="outside upper center", ncols=3, columnspacing=1.0)
         return picture(figure)
 
 

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from kgcp.report.bias.figures import change_by_reexposure
+from kgcp.report.bias.figures import change_by_reexposure, standardised_histogram
 from kgcp.report.bias.reexposure import Reexposed
 from kgcp.report.style import Picture, Points, picture
 
 
-def drawn(monkeypatch: pytest.MonkeyPatch, results: Sequence[Reexposed]) -> Axes:
-    """Return the panel of the changes by exposure, as it is drawn."""
+def panel_of(monkeypatch: pytest.MonkeyPatch, draw: Callable[[], Picture]) -> Axes:
+    """Return the panel of a figure, as it is drawn."""
     axes: list[Axes] = []
 
     def keep(figure: Figure, points: Sequence[Points] = ()) -> Picture:
@@ -23,9 +26,13 @@ def drawn(monkeypatch: pytest.MonkeyPatch, results: Sequence[Reexposed]) -> Axes
         return shown
 
     monkeypatch.setattr("kgcp.report.bias.figures.picture", keep)
-    change_by_reexposure(results)
+    draw()
     (panel,) = axes
     return panel
+
+
+def drawn(monkeypatch: pytest.MonkeyPatch, results: Sequence[Reexposed]) -> Axes:
+    return panel_of(monkeypatch, lambda: change_by_reexposure(results))
 
 
 def again(gain: float, radius_px: float, change_percent: float | None = 0.01) -> Reexposed:
@@ -52,3 +59,15 @@ def test_equal_changes_are_both_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     panel = drawn(monkeypatch, [again(0.6, 22.0), again(1.6, 22.0)])
     markers = {line.get_marker() for line in panel.get_lines()}
     assert {"v", "^"} <= markers
+
+
+def test_a_high_bar_is_not_behind_the_legend(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = SimpleNamespace(residual_m=np.full(5, 0.025), distance_m=np.full(5, 30.0))
+    numbers: Any = SimpleNamespace(data=data, sd_m=np.full(5, 0.01), explained_percent=np.zeros(5))
+    panel = panel_of(monkeypatch, lambda: standardised_histogram(numbers))
+    figure = panel.get_figure()
+    assert isinstance(figure, Figure)
+    (legend,) = figure.legends
+    box = legend.get_window_extent()
+    assert box.y0 >= panel.get_window_extent().y1
+    assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
