@@ -67,6 +67,11 @@ class NetworkUnknowns:
     terms: tuple[str, ...]  # of the distortion
     is_same_aspect: bool
 
+    @property
+    def is_rational(self) -> bool:
+        """Whether the distortion is a quotient of two polynomials."""
+        return "k4" in self.terms
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdjustedNetwork:
@@ -115,9 +120,10 @@ class CalibrationProblem:
 
     def with_unknowns(self, state: AdjustedNetwork, unknowns: NetworkUnknowns) -> AdjustedNetwork:
         """Return the adjustment of other unknowns; bends are those of the state, estimated anew."""
-        if state.unknowns.points is not unknowns.points:
-            return self.adjusted(state.camera, state.estimate, unknowns)
         cov, bends = state.network.observations.cov, state.network.bends
+        is_new = bends is None and not unknowns.is_rational
+        if is_new or state.unknowns.points is not unknowns.points:
+            return self.adjusted(state.camera, state.estimate, unknowns)
         return self._settled(state.camera, state.estimate, unknowns, cov, bends)
 
     def with_estimate(self, state: AdjustedNetwork, estimate: Estimate) -> AdjustedNetwork:
@@ -136,7 +142,7 @@ class CalibrationProblem:
         # Errors of a field that stays as stated would outweigh priors from the beginning, and terms
         # that can hardly be told apart grow to poles of the rational model between the discs. Those
         # of a field that may move are no noise: it would hardly leave its place.
-        if unknowns.points is PointModel.FIXED:
+        if unknowns.is_rational and unknowns.points is PointModel.FIXED:
             cov = self._fitting_at(camera, start)
         return self._settled(camera, start, unknowns, cov, None)
 
