@@ -89,7 +89,7 @@ def test_a_chance_that_nothing_meets_leaves_nothing(flight: Path, tmp_path: Path
 def test_an_impossible_chance_is_refused_in_one_line(flight: Path, tmp_path: Path) -> None:
     result = detect(flight, tmp_path, "--false-alarm", "0")
     assert result.exit_code == 1
-    assert "false_alarm: 0 is out of range; give a value above 0 and at most 1" in result.stderr
+    assert "--false-alarm: 0 is out of range; give a value above 0 and at most 1" in result.stderr
 
 
 def test_the_smallest_radius_reaches_the_search(flight: Path, tmp_path: Path) -> None:
