@@ -34,8 +34,8 @@ _FOCAL_PX = 200_000.0  # so long that images are affine
 _COLUMNS, _ROWS = 5, 4  # of a photograph
 _GAP_PX = 14.0
 _SHIFT_PX = 0.5  # of each disc from its place among the others, at most
-# In JPEGs: all places in a block are alike. Discs of R 5 px, of which each was three blocks from
-# the next one, were compressed alike, and a curve was learned from that.
+# In JPEGs: large enough that discs lie at all offsets within the blocks of 8 × 8 pixels. Discs of
+# R 5 px were three blocks apart; all were compressed alike, and the curve was learned wrongly.
 _SHIFT_IN_BLOCKS_PX, _GAP_BETWEEN_BLOCKS_PX = 4.0, 21.0
 _BRIGHT, _DARK = 0.62, 0.10
 _GRADIENT = 0.05  # of the light over one radius, at most over …

@@ -17,7 +17,7 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.georef.trajectory import Motion, spread_samples
 
 _SPLINE_ORDER, _TURN_ORDER = 4, 2
-# On driven paths at 1 Hz the orders are not reached: errors are 9 … 15 times smaller instead of 16.
+# At 1 Hz, steps of driven paths are too long for these orders; docs/method.md has what was found.
 _MARGIN = 4.0 / 3.0
 _NEARBY = np.arange(-1, 3)  # inner epochs about an interval, of which one may fit by chance
 # Variance of what is compared, for epochs with independent errors of variance 1.
