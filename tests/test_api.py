@@ -23,9 +23,9 @@ PAGE = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
 RING = kgcp.Ring("A", 0.9, 0.45, 0.642857143, 0.128571429, (0, 43, 78, 180))
 CAMERA = kgcp.Camera(640, 480, 800.0, 800.0, 320.0, 240.0)
-# as a program without types calls them
-make_settings: Any = kgcp.DetectSettings
-changed: Any = replace
+# `Any`, to pass wrong types as well, and words where the types ask for an enumeration.
+untyped_settings: Any = kgcp.DetectSettings
+untyped_replace: Any = replace
 
 
 def test_every_public_name_is_there_and_described() -> None:
@@ -99,24 +99,30 @@ def test_a_frame_without_a_target_is_a_miss() -> None:
 
 @pytest.mark.parametrize("word", ["linear", "srgb", "unknown"])
 def test_a_camera_takes_the_response_as_a_word(word: str) -> None:
-    camera = changed(CAMERA, response=word)
+    camera = untyped_replace(CAMERA, response=word)
     assert isinstance(camera.response, Response)
     assert camera == replace(CAMERA, response=Response(word))
 
 
 def test_the_method_is_taken_as_a_word() -> None:
-    assert make_settings(method="paper").method is Method.PAPER
+    assert untyped_settings(method="paper").method is Method.PAPER
 
 
 @pytest.mark.parametrize(
     ("make", "problem"),
     [
-        (lambda: make_settings(method="papers"), "method: 'papers' .* one of model, paper"),
-        (lambda: changed(CAMERA, response="gamma"), "response: 'gamma' .* linear, srgb, unknown"),
-        (lambda: changed(CAMERA, response=None), "response: None is not a known value"),
-        (lambda: changed(CAMERA, time_reference="begin"), "time_reference: .* start, middle, end"),
-        (lambda: changed(CAMERA, width=640.5), "width: 640.5 px is not a whole number"),
-        (lambda: changed(CAMERA, fx="800"), "fx: '800' is not a number"),
+        (lambda: untyped_settings(method="papers"), "method: 'papers' .* one of model, paper"),
+        (
+            lambda: untyped_replace(CAMERA, response="gamma"),
+            "response: 'gamma' .* linear, srgb, unknown",
+        ),
+        (lambda: untyped_replace(CAMERA, response=None), "response: None is not a known value"),
+        (
+            lambda: untyped_replace(CAMERA, time_reference="begin"),
+            "time_reference: .* start, middle, end",
+        ),
+        (lambda: untyped_replace(CAMERA, width=640.5), "width: 640.5 px is not a whole number"),
+        (lambda: untyped_replace(CAMERA, fx="800"), "fx: '800' is not a number"),
         (lambda: kgcp.RunOptions(jobs=-1), "jobs: -1 is out of range"),
         (lambda: kgcp.RunOptions(frame_timeout_s=0.0), "frame_timeout_s: 0 s .* a value above 0 s"),
         (lambda: kgcp.Selection(max_sd_m=np.nan), "max_sd_m: nan m is out of range"),
@@ -136,12 +142,12 @@ def test_wrong_arguments_are_named(make: Callable[[], object], problem: str) -> 
 
 
 @pytest.mark.parametrize("floor_px", [np.nan, -1.0])
-def test_a_floor_of_marks_that_cannot_be_is_not_written(floor_px: float) -> None:
+def test_a_mark_floor_out_of_range_is_refused(floor_px: float) -> None:
     with pytest.raises(kgcp.KgcpError, match=r"mark_floor_px: .* px is out of range"):
         MapPoints("EPSG:25832", (), CAMERA, mark_floor_px=floor_px)
 
 
-def test_targets_may_come_one_by_one() -> None:
+def test_targets_may_come_from_a_generator() -> None:
     grey = np.full((480, 640), 90, np.uint8)
     (miss,) = kgcp.measure_frame(grey, CAMERA, (kgcp.Target(ring) for ring in [RING]))
     assert isinstance(miss, kgcp.Miss)

@@ -276,10 +276,10 @@ def test_another_calibration_is_compared_with(
         ("notes.txt", "my camera\n", "; convert it or write the values to a camera.toml"),
     ],
 )
-def test_a_mistake_in_another_calibration_is_not_sought_in_a_flight(
+def test_errors_about_the_calibration_to_compare_with_do_not_name_flight_toml(
     photos: Path, tmp_path: Path, name: str, text: str, message: str
 ) -> None:
-    """There is no flight.toml, whose [camera] messages used to speak of."""
+    """There is no flight.toml whose [camera] could be corrected."""
     other = tmp_path / name
     other.write_text(text)
     result = run(photos, "--field", photos / "field.toml", "--against", other, *QUIET)
@@ -293,10 +293,8 @@ def test_too_few_photographs_are_one_line(photos: Path, tmp_path: Path) -> None:
     files = [photos / "photo1.png", photos / "photo2.png", photos / "photo10.png"]
     result = run(*files, "--field", photos / "field.toml", "--out", tmp_path, *QUIET)
     assert result.exit_code == 1
-    assert (
-        "2 of 3 photographs can be used, and 3 are needed; left out: 1 too_few (photo10.png: "
-        in (result.stderr)
-    )
+    counts = "2 of 3 photographs can be used, and 3 are needed; left out: 1 too_few (photo10.png: "
+    assert counts in result.stderr
     assert result.stderr.endswith("; show the whole field, from nearer and sharp\n")
     assert not (tmp_path / "camera.toml").exists()
 
@@ -313,10 +311,12 @@ def test_copies_and_damaged_files_do_not_count(photos: Path, tmp_path: Path) -> 
     assert "2 of 4 photographs can be used, and 3 are needed; left out: 1 dup" in result.stderr
     assert "1 duplicate (b.png: of a.png), 1 decode_failed (d.png: " in result.stderr
     assert "; take more photographs, each from another place; copy the files again" in result.stderr
-    assert "description" not in result.stderr  # of the field, which is right
+    assert "description" not in result.stderr  # the field's, which is right
 
 
-def test_photographs_of_two_sizes_are_not_the_field_s_fault(photos: Path, tmp_path: Path) -> None:
+def test_too_few_photographs_of_one_size_are_explained_by_their_sizes(
+    photos: Path, tmp_path: Path
+) -> None:
     folder = tmp_path / "photos"
     folder.mkdir()
     for index in (1, 2, 3, 4):
@@ -325,9 +325,8 @@ def test_photographs_of_two_sizes_are_not_the_field_s_fault(photos: Path, tmp_pa
         cv2.imwrite(str(folder / f"{index}.png"), grey if index < 3 else np.rot90(grey))
     result = run(folder, "--field", photos / "field.toml", "--out", tmp_path / "out", *QUIET)
     assert result.exit_code == 1
-    assert "left out: 2 other_size (3.png: 300 x 400 px, most have 400 x 300, which is" in (
-        result.stderr
-    )
+    sizes = "left out: 2 other_size (3.png: 300 x 400 px, most have 400 x 300, which is"
+    assert sizes in result.stderr
     assert result.stderr.endswith("of one size, none of them turned or cropped afterwards\n")
 
 

@@ -117,20 +117,20 @@ def test_an_error_of_an_option_begins_with_its_dashes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("option", ["--max-sd", "--mark-floor-px"])
-def test_what_is_no_number_is_wrong_usage(tmp_path: Path, option: str) -> None:
+def test_nan_as_the_value_of_an_option_is_wrong_usage(tmp_path: Path, option: str) -> None:
     result = CliRunner().invoke(main, ["export-gcp", str(tmp_path), option, "nan"])
     assert result.stderr.endswith(f"Error: Invalid value for '{option}': nan is not a number.\n")
     assert result.exit_code == 2
 
 
-def test_an_error_names_the_option_as_it_is_written(tmp_path: Path) -> None:
+def test_an_error_names_an_option_with_hyphens_between_its_words(tmp_path: Path) -> None:
     result = CliRunner().invoke(main, ["detect", str(tmp_path), "--jobs", "0", "--min-score", "2"])
     assert result.stderr.startswith("kgcp: error: --min-score: 2 is out of range; ")
     assert result.exit_code == 1
 
 
 @pytest.mark.parametrize("path", [None, "results/run.json"])
-def test_a_full_disk_is_one_line(path: str | None) -> None:
+def test_a_full_disk_is_reported_in_one_line(path: str | None) -> None:
     code, _, stderr = run_raising(OSError(errno.ENOSPC, "No space left on device", path))
     where = "" if path is None else f"{path}: "
     assert stderr == f"kgcp: error: {where}no space left; make room, then repeat the command\n"
@@ -139,7 +139,7 @@ def test_a_full_disk_is_one_line(path: str | None) -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Popen closes no streams there")
 @pytest.mark.parametrize("closed", [(2,), (1, 2), (0, 1, 2)])
-def test_streams_that_are_closed_swallow_what_is_printed(
+def test_detection_runs_where_standard_streams_are_closed(
     unmeasured: SampleFlight, closed: tuple[int, ...]
 ) -> None:
     call = ["-m", "kgcp", "detect", str(unmeasured.path), "--jobs", "1"]

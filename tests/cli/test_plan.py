@@ -113,7 +113,7 @@ def test_the_figure_is_drawn(flight: Path) -> None:
         assert picture.width > 1000
 
 
-def test_a_name_is_drawn_as_it_is_however_long(flight: Path) -> None:
+def test_a_long_name_with_dollars_is_drawn_whole_in_several_lines(flight: Path) -> None:
     toml = (flight / "flight.toml").read_text(encoding="utf-8")
     name = "$\\frac{$ " + "roof " * 20
     assert toml.count('name = "A"') == 1

@@ -182,7 +182,7 @@ def test_lists_of_points_take_a_unit(tmp_path: Path, monkeypatch: pytest.MonkeyP
         ("--rolling 0.02 --motion nan 1", "--motion: nan px/s is out of range", 1),
     ],
 )
-def test_motion_that_cannot_be_is_refused(
+def test_motion_without_a_rolling_shutter_or_out_of_range_is_refused(
     tmp_path: Path, options: str, words: str, code: int
 ) -> None:
     result = CliRunner().invoke(main, ["simulate", str(tmp_path / "a"), *options.split()])

@@ -14,12 +14,15 @@ from kgcp.georef.target_positions import Vehicle
 from kgcp.georef.trajectory import Motion, body_to_ned
 from kgcp.settings import VehicleSettings
 
+Drive = tuple[FloatArray, FloatArray, FloatArray]
+"""Times [s], positions [m] and headings [deg]."""
+
 _STEP_S = 0.005
 _LEVER_M = np.array([-0.8, 0.15, -1.95])
 
 
-def _slalom() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return times, positions and headings [deg] of a car round cones every 24 m, at 8 m/s."""
+def _slalom() -> Drive:
+    """Return the path of a car round cones every 24 m, at 8 m/s."""
     time_s = np.arange(0.0, 240.0, _STEP_S)
     angle = 2.0 * np.pi * time_s / 6.0
     position_m = np.column_stack((8.0 * time_s, 1.5 * np.sin(angle), np.zeros_like(time_s)))
@@ -27,8 +30,8 @@ def _slalom() -> tuple[FloatArray, FloatArray, FloatArray]:
     return time_s, position_m, heading_deg
 
 
-def _streets() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The same of right-angled turns of 12 m radius after every 6 s at 6 m/s, and of stops."""
+def _streets() -> Drive:
+    """Return a path with right-angled turns of 12 m radius after every 6 s at 6 m/s, and stops."""
     time_s = np.arange(0.0, 240.0, _STEP_S)
     turn_s = 0.5 * np.pi * 12.0 / 6.0
     phase, number = np.mod(time_s, 6.0 + turn_s), time_s // (6.0 + turn_s)
@@ -40,10 +43,10 @@ def _streets() -> tuple[FloatArray, FloatArray, FloatArray]:
     return time_s, np.cumsum(rates, axis=0) * _STEP_S, np.degrees(heading)
 
 
-def _drawn(
-    path: tuple[FloatArray, FloatArray, FloatArray], rate_hz: float, sd_m: float, sd_deg: float
+def _sampled(
+    path: Drive, rate_hz: float, sd_m: float, sd_deg: float
 ) -> tuple[Motion, FloatArray, FloatArray, FloatArray]:
-    """Return a path's motion by noisy epochs, and times, places and turns between these."""
+    """Return a path's motion by noisy epochs, and true times, positions and turns between them."""
     rng = np.random.default_rng(3)
     time_s, position_m, heading_deg = path
     epochs = np.arange(0, len(time_s), round(1.0 / (rate_hz * _STEP_S)))
@@ -68,13 +71,13 @@ def _standardised(error: FloatArray, cov: FloatArray) -> FloatArray:
 @pytest.mark.parametrize("path", [_slalom, _streets])
 @pytest.mark.parametrize("rate_hz", [1.0, 5.0, 10.0, 200.0])
 @pytest.mark.parametrize(("sd_m", "sd_deg"), [(0.01, 0.05), (0.2, 1.0)])
-def test_deviations_are_those_of_the_errors(
-    path: Callable[[], tuple[FloatArray, FloatArray, FloatArray]],
+def test_stated_deviations_agree_with_the_errors_between_epochs(
+    path: Callable[[], Drive],
     rate_hz: float,
     sd_m: float,
     sd_deg: float,
 ) -> None:
-    motion, time_s, position_m, turns = _drawn(path(), rate_hz, sd_m, sd_deg)
+    motion, time_s, position_m, turns = _sampled(path(), rate_hz, sd_m, sd_deg)
     errors = interpolation_errors(motion, time_s)
     states = motion.states(time_s)
     error = states.position_m - position_m
@@ -90,21 +93,21 @@ def test_deviations_are_those_of_the_errors(
 
 
 @pytest.mark.parametrize(("rate_hz", "most"), [(5.0, 0.01), (10.0, 0.003), (200.0, 0.003)])
-def test_well_sampled_paths_have_the_deviations_of_their_epochs(
+def test_well_sampled_paths_hardly_exceed_the_deviations_of_their_epochs(
     rate_hz: float, most: float
 ) -> None:
-    motion, time_s, _, _ = _drawn(_streets(), rate_hz, 0.01, 0.05)
+    motion, time_s, _, _ = _sampled(_streets(), rate_hz, 0.01, 0.05)
     errors = interpolation_errors(motion, time_s)
     growth = np.trace(errors.cov_position_m2, axis1=1, axis2=2) / (3.0 * 0.01**2)
     assert np.mean(growth) < most
-    # Epochs of which nothing is stated count their noise among the misfits, scaled like these.
+    # Without stated deviations, nothing of the noise is taken off the misfits.
     silent = replace(motion, sd_position_m=None, sd_attitude_deg=None)
     growth = np.trace(interpolation_errors(silent, time_s).cov_position_m2, axis1=1, axis2=2)
     assert np.mean(growth) / (3.0 * 0.01**2) < 0.02
 
 
-def test_slow_epochs_of_a_turning_car_are_centimetres_off() -> None:
-    motion, time_s, position_m, _ = _drawn(_streets(), 1.0, 0.001, 0.01)
+def test_deviations_at_1_hz_are_large_where_errors_are() -> None:
+    motion, time_s, position_m, _ = _sampled(_streets(), 1.0, 0.001, 0.01)
     errors = interpolation_errors(motion, time_s)
     sd_m = np.sqrt(np.trace(errors.cov_position_m2, axis1=1, axis2=2))
     off_m = np.linalg.norm(motion.states(time_s).position_m - position_m, axis=1)
@@ -113,7 +116,7 @@ def test_slow_epochs_of_a_turning_car_are_centimetres_off() -> None:
 
 
 def test_nothing_is_added_at_epochs() -> None:
-    motion, *_ = _drawn(_slalom(), 1.0, 0.01, 0.05)
+    motion, *_ = _sampled(_slalom(), 1.0, 0.01, 0.05)
     errors = interpolation_errors(motion, motion.time_s)
     np.testing.assert_allclose(errors.cov_position_m2, 0.0, atol=1e-20)
     np.testing.assert_allclose(errors.cov_turn_rad2, 0.0, atol=1e-20)
@@ -121,7 +124,7 @@ def test_nothing_is_added_at_epochs() -> None:
 
 @pytest.mark.parametrize("epochs", [2, 3, 4, 5, 6])
 def test_short_trajectories_have_errors_too(epochs: int) -> None:
-    """A circle of 20 m radius at 10 m/s; of two epochs, what a car may do."""
+    """On a circle of 20 m radius at 10 m/s; two epochs get the accelerations assumed of a car."""
     angle = 0.5 * np.arange(float(epochs))
     position_m = 20.0 * np.column_stack((np.cos(angle), np.sin(angle), np.zeros(epochs)))
     heading = body_to_ned(np.zeros(epochs), np.zeros(epochs), np.degrees(angle) + 90.0)
@@ -135,8 +138,8 @@ def test_short_trajectories_have_errors_too(epochs: int) -> None:
     assert sd_m.max() < 15.0 * off_m.max()  # parabolas of two more epochs do better than lines
 
 
-def test_epochs_close_to_others_are_no_measure_of_long_steps() -> None:
-    """Every second, and once more a millisecond later: noise over that is no acceleration."""
+def test_pairs_of_close_epochs_do_not_enlarge_the_errors_of_long_steps() -> None:
+    """Epochs every second and a millisecond later: noise between such two is no acceleration."""
     rng = np.random.default_rng(4)
     time_s = np.sort(np.concatenate((np.arange(0.0, 60.0), np.arange(0.0, 60.0) + 0.001)))
     position_m = np.column_stack((5.0 * time_s, np.zeros(120), np.zeros(120)))
@@ -155,9 +158,9 @@ def test_epochs_close_to_others_are_no_measure_of_long_steps() -> None:
     assert sd_deg.max() < 0.04
 
 
-def test_a_target_knows_its_share_of_interpolation() -> None:
-    """At an epoch there is none; between, it is what the covariance has more than at the epochs."""
-    motion, *_ = _drawn(_slalom(), 1.0, 0.01, 0.05)
+def test_the_covariance_of_a_target_contains_the_error_of_interpolation() -> None:
+    """It is 0 at epochs; between them, it is what the covariance exceeds that at the epochs by."""
+    motion, *_ = _sampled(_slalom(), 1.0, 0.01, 0.05)
     time_s = motion.time_s[10] + np.array([0.0, 0.5])
     local_frame = LocalFrame.at("EPSG:25832", np.array([690000.0, 5336000.0, 500.0]))
     vehicle = Vehicle(motion, VehicleSettings((-0.8, 0.15, -1.95)), local_frame)

@@ -1,4 +1,4 @@
-"""EO devices: which point is which, symmetric ones refused."""
+"""EO devices: which point is which; symmetric devices, and discs that do not fit, are refused."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from kgcp.geometry.pose import rotation_about
 from kgcp.network.ground.device import orient_by_device, require_distinct
 from kgcp.network.ground.resection import NoPoseError
 
+CAMERA = Camera(4000, 3000, 3000.0, 3000.0, 1999.5, 1499.5)
 SQUARE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
 
 
@@ -52,11 +53,8 @@ def test_images_that_fit_no_or_two_permutations_give_no_pose() -> None:
         orient_by_device(camera, SQUARE, pixels, cov)
 
 
-CAMERA = Camera(4000, 3000, 3000.0, 3000.0, 1999.5, 1499.5)
-
-
 def device_images(points_m: FloatArray, rng: np.random.Generator, sd_px: float) -> FloatArray:
-    """Images of a device 2 m below a tilted camera."""
+    """Return images of a device, turned at random, 2 m before a tilted camera."""
     tilt = rotation_about(np.array([0.3, -0.2, 0.0]))
     turn = rotation_about(np.array([0.0, 0.0, rng.uniform(0.0, 6.0)]))
     in_camera = points_m @ (tilt @ turn @ np.diag((1.0, -1.0, -1.0))).T + (0.1, 0.1, 2.0)
@@ -73,7 +71,7 @@ def device_images(points_m: FloatArray, rng: np.random.Generator, sd_px: float) 
     ],
     ids=["y the other way", "z the other way", "x and y exchanged", "too long"],
 )
-def test_a_device_that_is_built_otherwise_gives_no_pose(built: FloatArray) -> None:
+def test_a_device_that_is_built_otherwise_than_described_gives_no_pose(built: FloatArray) -> None:
     rng = np.random.default_rng(1)
     cov = np.repeat(0.02**2 * np.eye(2)[None], len(built), axis=0)
     reasons = []
@@ -81,10 +79,11 @@ def test_a_device_that_is_built_otherwise_gives_no_pose(built: FloatArray) -> No
         with pytest.raises(NoPoseError) as caught:
             orient_by_device(CAMERA, DEVICE_M, device_images(built, rng, 0.02), cov)
         reasons.append(str(caught.value))
+    # in other frames, two permutations fit alike
     assert any("the discs do not fit the device (RMS" in reason for reason in reasons)
 
 
-def test_deviations_follow_residuals_that_are_larger_than_stated() -> None:
+def test_residuals_larger_than_stated_enlarge_the_deviations() -> None:
     rng = np.random.default_rng(1)
     stated = np.repeat(0.01**2 * np.eye(2)[None], len(DEVICE_M), axis=0)
     sd_m = []

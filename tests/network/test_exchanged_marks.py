@@ -50,13 +50,13 @@ def test_exchanged_marks_are_told_from_right_ones(
     assert least * trials <= named <= trials
 
 
-@pytest.mark.parametrize(("count", "turned"), [(4, 3), (4, 4), (5, 5), (8, 4), (15, 4)])
-def test_names_that_are_exchanged_in_a_circle_are_told(count: int, turned: int) -> None:
-    """As of corners that are counted from the wrong one."""
+@pytest.mark.parametrize(("count", "length"), [(4, 3), (4, 4), (5, 5), (8, 4), (15, 4)])
+def test_names_that_are_exchanged_in_a_cycle_are_found(count: int, length: int) -> None:
+    """Each of some targets has the mark of the one before, as if counted from the wrong one."""
     rng = np.random.default_rng(7)
     for _ in range(5):
         marks, positions = marked_frame(rng, count, 10.0)
-        names = [*marks][:turned]
+        names = [*marks][:length]
         exchanged = {**marks, **{name: marks[names[at - 1]] for at, name in enumerate(names)}}
         assert exchanged_marks(exchanged, positions, CAMERA) == tuple(names)
 

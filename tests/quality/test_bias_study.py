@@ -23,7 +23,6 @@ _CAMERA = Camera(width=1600, height=1200, fx=2300.0, fy=2300.0, cx=800.0, cy=600
 _TARGET = Target(Ring("A", 0.9, 0.45, 0.642857143, 0.128571429, (0.0, 43.0, 78.0, 180.0)))
 _NOTHING = Exposure(*[None] * 9)
 _METHOD = Method.MODEL
-_NORTH = np.array([0.0, 5.0, 0.0])  # m/s
 _START = np.array([430606.1, 4583523.0, 120.0])
 
 _TIME_S = np.arange(0.0, 10.01, 0.1)
@@ -234,20 +233,22 @@ def test_without_edge_shift_there_are_no_edge_distances() -> None:
     assert edge_distances(study.measured[0], _METHOD) is None
 
 
-def test_a_rolling_shutters_camera_flies_on_until_the_target_is_exposed() -> None:
-    """Ahead of the vehicle and behind it in turn, at 5 m/s: distances are those of the row's time.
+def test_reference_distances_are_those_when_a_rolling_shutter_exposes_the_target() -> None:
+    """The camera is ahead of the vehicle and behind it in turn; both go north at 5 m/s.
 
-    The image's up is north, the way of vehicle and camera: targets behind are lower in the image,
-    and exposed later. So all reference distances would be too short, as if the scale were wrong.
+    North is up in the image. Targets behind the camera are lower in the image and exposed later,
+    when the camera is farther away; those ahead are exposed earlier. With the camera's place at the
+    middle row, all reference distances would be too short.
     """
     camera = replace(_CAMERA, readout_s=0.03)
     count, above_m = 40, 60.0
     time_s = 5.0 + 0.1 * np.arange(float(count))
-    whole = replace(_TRAJECTORY, time_s=_TIME_S, position_map=_START + np.outer(_TIME_S, _NORTH))
-    target_positions = TargetPositions.of("EPSG:25831", [_TARGET], whole, VehicleSettings())
+    driven_m = np.outer(_TIME_S, (0.0, 5.0, 0.0))
+    northward = replace(_TRAJECTORY, time_s=_TIME_S, position_map=_START + driven_m)
+    target_positions = TargetPositions.of("EPSG:25831", [_TARGET], northward, VehicleSettings())
 
     def sight_at(at_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return places of the camera, and from it to the target, in ENU."""
+        """Return the camera's positions, and the vectors from it to the target, in ENU."""
         places = target_positions.positions(["A"] * len(at_s), at_s.tolist())
         target = np.array([each.position_m for each in places if not isinstance(each, NoPosition)])
         ahead_m = 12.0 * np.sin(2.0 * np.pi * at_s / 8.0)
@@ -259,18 +260,12 @@ def test_a_rolling_shutters_camera_flies_on_until_the_target_is_exposed() -> Non
         _, sight = sight_at(time_s + delay_s)
         pixels = camera.project(sight * [1.0, -1.0, -1.0])
         delay_s = camera.readout_s * camera.rows_since_middle(pixels)
-    attempts = [
-        replace(
-            _attempt(index, float(np.linalg.norm(sight[index])), tuple(pixels[index])),
-            time_s=float(time_s[index]),
-        )
-        for index in range(count)
-    ]
-    attempts = [
-        replace(each, sighting=replace(each.sighting, time_s=each.time_s))
-        for each in attempts
-        if each.sighting is not None
-    ]
+    attempts = []
+    for index, at_s in enumerate(time_s.tolist()):
+        attempt = _attempt(index, float(np.linalg.norm(sight[index])), tuple(pixels[index]))
+        assert attempt.sighting is not None
+        sighting = replace(attempt.sighting, time_s=at_s)
+        attempts.append(replace(attempt, time_s=at_s, sighting=sighting))
     centre, _ = sight_at(time_s)
     local_frame = target_positions.local_frame
     grids = local_frame.grid_rotation(centre)

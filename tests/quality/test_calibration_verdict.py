@@ -104,8 +104,7 @@ def test_two_focal_lengths_are_estimated_where_they_differ() -> None:
     assert "fy" not in wider.tangled
 
 
-def test_pixels_that_are_not_square_are_thought_of_where_one_focal_length_fits_badly() -> None:
-    """The advice spoke of zoom and focus only."""
+def test_two_focal_lengths_are_advised_where_one_fits_badly_and_two_were_not_tried() -> None:
     hint = "Estimate two focal lengths: the pixels may not be square."
     made = views(camera=replace(CAMERA, fy=1530.0))
     radial = calibrated(made)
@@ -116,7 +115,7 @@ def test_pixels_that_are_not_square_are_thought_of_where_one_focal_length_fits_b
 
 @pytest.mark.parametrize("points", [PointModel.FIXED, PointModel.STIFF])
 def test_a_rational_model_keeps_its_terms_small_on_a_field_with_errors(points: PointModel) -> None:
-    """Its terms grew against each other to a pole, and the photographs were blamed for it."""
+    """The errors must not drive k1 and k4 against each other, to a pole between the discs."""
     errors_m = 0.0002 * np.random.default_rng(3).standard_normal((len(FIELD.names()), 3))
     result = calibrated(views(bend_m=errors_m, noise_px=0.2 * SD_PX), points, LensModel.RATIONAL)
     assert np.abs([result.camera.k1, result.camera.k4]).max() < 0.3

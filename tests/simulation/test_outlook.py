@@ -178,7 +178,7 @@ def test_circles_of_the_smallest_plain_target_are_told_apart(
     assert least_plain_px(target) == pytest.approx(least_px)
 
 
-def test_what_is_blurred_away_is_not_found() -> None:
+def test_rings_whose_dots_are_blurred_away_are_not_found() -> None:
     """Of six rendered rings of 10 px, none was measured at σ = 4 px, nor at 8 px of motion."""
     heights = [
         0.5 * TARGET.ring.outer_diameter_m * CAMERA.mean_focal_px / px for px in (30.0, 10.0)
@@ -191,7 +191,7 @@ def test_what_is_blurred_away_is_not_found() -> None:
         assert far.smallest_diameter_m > 1.5 * TARGET.ring.outer_diameter_m
 
 
-def test_plain_discs_with_edges_of_smooth_blobs_are_not_found() -> None:
+def test_plain_discs_blurred_to_smooth_blobs_are_not_found() -> None:
     disc = PlainTarget("T", (0.4,), PlainPolarity.DARK, (0.0, 0.0, 0.0), border_m=0.1)
     height_m = 0.2 * CAMERA.mean_focal_px / 6.0
     for psf_px, is_found in ((2.5, True), (3.5, False)):
@@ -199,6 +199,6 @@ def test_plain_discs_with_edges_of_smooth_blobs_are_not_found() -> None:
         assert (outlook.found > 0.0) == is_found
 
 
-def test_blur_in_which_no_accuracy_is_known_is_refused() -> None:
+def test_blur_too_large_for_a_known_accuracy_is_refused() -> None:
     with pytest.raises(SettingError, match="blur: 30 px and a point spread of 10 px leave too"):
         look_ahead(CAMERA, None, TARGET, [30.0], Conditions(psf_px=10.0, blur_px=30.0))

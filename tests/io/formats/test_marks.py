@@ -20,7 +20,7 @@ def read(path: Path, text: str) -> object:
     return read_marks(path, {"a/f.png", "b/f.png"}, {"A", "B"}, CAMERA)
 
 
-def test_names_are_those_of_any_system(tmp_path: Path) -> None:
+def test_frames_may_be_named_with_backslashes(tmp_path: Path) -> None:
     marks = read(tmp_path / "m.csv", HEADER + SOUND)
     assert read(tmp_path / "m.csv", HEADER + SOUND.replace("a/f.png", ".\\a\\f.png")) == marks
 

@@ -207,7 +207,7 @@ except Rejection as rejection:
         assert caught.detail == f"{shape[1]} x {shape[0]} px, the camera has {WIDTH} x {HEIGHT}"
 
 
-def test_threads_keep_each_other_s_damage_and_stderr_apart(tmp_path: Path) -> None:
+def test_frames_read_in_threads_have_their_own_damage_and_stderr_is_kept(tmp_path: Path) -> None:
     whole, damaged = tmp_path / "whole.jpg", tmp_path / "damaged.jpg"
     content = encoded(textured(), ".jpg")
     middle = len(content) // 2

@@ -301,11 +301,11 @@ def test_a_worker_whose_parent_is_gone_ends_without_a_traceback(
 ) -> None:
     """A parent that is killed with results unread resets the pipe."""
 
-    class Gone:
+    class ClosedPipe:
         def send(self, _: object) -> None: ...
 
         def recv_bytes(self) -> bytes:
             raise error
 
     monkeypatch.setattr(signal, "signal", lambda *_: None)  # this process can be interrupted
-    _serve(Gone())
+    _serve(ClosedPipe())

@@ -23,12 +23,14 @@ def two_threads() -> Iterator[None]:
 
 
 def threads() -> set[int]:
+    """Return the numbers of threads of all numeric libraries."""
     return {cv2.getNumThreads(), *(library["num_threads"] for library in threadpool_info())}
 
 
 @pytest.mark.usefixtures("two_threads")
 def test_the_last_of_calls_that_overlap_restores_the_threads() -> None:
     before = threads()
+    assert 2 in before
     first, second = ExitStack(), ExitStack()
     first.enter_context(single_threaded())
     second.enter_context(single_threaded())
@@ -37,4 +39,3 @@ def test_the_last_of_calls_that_overlap_restores_the_threads() -> None:
     assert threads() == {1}, "the other call is still at work"
     second.close()
     assert threads() == before
-    assert 2 in before

@@ -1,4 +1,4 @@
-"""What the figures show where there is little to draw."""
+"""Labels, marks and legends of the figures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from kgcp.report.style import Picture, Points, picture
 
 
 def panel_of(monkeypatch: pytest.MonkeyPatch, draw: Callable[[], Picture]) -> Axes:
-    """Return the panel of a figure, as it is drawn."""
+    """Return the panel of a figure, as it is reexposure_panel."""
     axes: list[Axes] = []
 
     def keep(figure: Figure, points: Sequence[Points] = ()) -> Picture:
@@ -31,11 +31,12 @@ def panel_of(monkeypatch: pytest.MonkeyPatch, draw: Callable[[], Picture]) -> Ax
     return panel
 
 
-def drawn(monkeypatch: pytest.MonkeyPatch, results: Sequence[Reexposed]) -> Axes:
+def reexposure_panel(monkeypatch: pytest.MonkeyPatch, results: Sequence[Reexposed]) -> Axes:
+    """Return the panel of the changes by exposure."""
     return panel_of(monkeypatch, lambda: change_by_reexposure(results))
 
 
-def again(gain: float, radius_px: float, change_percent: float | None = 0.01) -> Reexposed:
+def reexposed(gain: float, radius_px: float, change_percent: float | None = 0.01) -> Reexposed:
     return Reexposed(0, gain, radius_px, change_percent, 0.02, 0.0)
 
 
@@ -43,25 +44,27 @@ def again(gain: float, radius_px: float, change_percent: float | None = 0.01) ->
 def test_radii_are_numbered_however_close_they_are(
     monkeypatch: pytest.MonkeyPatch, radii: tuple[float, ...]
 ) -> None:
-    panel = drawn(monkeypatch, [again(gain, radius) for radius in radii for gain in (0.6, 1.6)])
+    panel = reexposure_panel(
+        monkeypatch, [reexposed(gain, radius) for radius in radii for gain in (0.6, 1.6)]
+    )
     low, high = panel.get_xlim()
     labels = zip(panel.get_xticks(), panel.get_xticklabels(), strict=True)
     assert sum(low <= tick <= high and bool(label.get_text()) for tick, label in labels) >= 2
 
 
-def test_the_legend_has_what_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    panel = drawn(monkeypatch, [again(0.6, 22.0), again(1.6, 22.0, None)])
+def test_the_legend_names_only_what_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    panel = reexposure_panel(monkeypatch, [reexposed(0.6, 22.0), reexposed(1.6, 22.0, None)])
     _, labels = panel.get_legend_handles_labels()
     assert sorted(labels) == ["grey × 0.6", "grey × 1.6: lost"]
 
 
-def test_equal_changes_are_both_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    panel = drawn(monkeypatch, [again(0.6, 22.0), again(1.6, 22.0)])
+def test_darker_and_brighter_frames_have_different_marks(monkeypatch: pytest.MonkeyPatch) -> None:
+    panel = reexposure_panel(monkeypatch, [reexposed(0.6, 22.0), reexposed(1.6, 22.0)])
     markers = {line.get_marker() for line in panel.get_lines()}
     assert {"v", "^"} <= markers
 
 
-def test_a_high_bar_is_not_behind_the_legend(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_legend_of_the_histogram_is_above_its_bars(monkeypatch: pytest.MonkeyPatch) -> None:
     data = SimpleNamespace(residual_m=np.full(5, 0.025), distance_m=np.full(5, 30.0))
     numbers: Any = SimpleNamespace(data=data, sd_m=np.full(5, 0.01), explained_percent=np.zeros(5))
     panel = panel_of(monkeypatch, lambda: standardised_histogram(numbers))
