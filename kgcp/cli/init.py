@@ -43,7 +43,7 @@ _WIDTH = 100
     "--lever-arm",
     "lever_arm_m",
     metavar="F R D",
-    type=float,
+    type=NumberRange(-1000.0, 1000.0),
     nargs=3,
     help="From the trajectory's point to the target's centre: forward, right, down [m].",
 )

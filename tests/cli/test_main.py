@@ -116,9 +116,18 @@ def test_an_error_of_an_option_begins_with_its_dashes(tmp_path: Path) -> None:
     assert result.exit_code == 1
 
 
-@pytest.mark.parametrize("option", ["--max-sd", "--mark-floor-px"])
-def test_nan_as_the_value_of_an_option_is_wrong_usage(tmp_path: Path, option: str) -> None:
-    result = CliRunner().invoke(main, ["export-gcp", str(tmp_path), option, "nan"])
+@pytest.mark.parametrize(
+    ("command", "option", "others"),
+    [
+        ("export-gcp", "--max-sd", ()),
+        ("export-gcp", "--mark-floor-px", ()),
+        ("init", "--lever-arm", ("0", "0")),
+    ],
+)
+def test_nan_as_the_value_of_an_option_is_wrong_usage(
+    tmp_path: Path, command: str, option: str, others: tuple[str, ...]
+) -> None:
+    result = CliRunner().invoke(main, [command, str(tmp_path), option, "nan", *others])
     assert result.stderr.endswith(f"Error: Invalid value for '{option}': nan is not a number.\n")
     assert result.exit_code == 2
 

@@ -456,7 +456,7 @@ def test_a_field_orients_frames_in_its_own_frame(tmp_path: Path) -> None:
     ("stated", "words"),
     [
         ("pitch_m = 0.03", ""),
-        ("pitch_m = 30.0", "the discs are 1e+03 times as large as the field says"),
+        ("pitch_m = 30.0", "the discs are 1000 times as large as the field says"),
         ("pitch_m = 0.027", "the discs are 0.9 times as large as the field says"),
     ],
 )

@@ -490,7 +490,7 @@ def _with_waves(state: DiscState, tone: Tone, waves: FloatArray) -> DiscState:
 def _is_bent(joint: JointFit) -> bool:
     """Return whether a curve is more bent than one that hardly is, and than the model may lack.
 
-    Of film's curve in JPEGs of quality 92, the excess is 1.6 to 2.1. By its third power as above, a
+    Of film's curve in JPEGs of quality 92, the excess is 1.3 to 2.1. By its third power as above, a
     quarter of the photographs of dark discs of R 5 px seemed to be sRGB's: centres were off by
     0.012 px where light falls off by 5 % over the radius, with its square by 0.007 px.
     """

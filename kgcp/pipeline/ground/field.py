@@ -104,8 +104,9 @@ def field_doubts(frames: Sequence[OrientedFrame[FieldPose]], field: AnyField) ->
     scale = float(np.median(scales))
     if not field.is_diameter_stated or abs(scale - 1.0) <= _RADIUS_SHARE:
         return ()
+    times = f"{scale:.0f}" if scale > 100.0 else f"{scale:.3g}"
     doubt = (
-        f"the discs are {scale:.3g} times as large as the field says; look at its distances, which"
+        f"the discs are {times} times as large as the field says; look at its distances, which"
         " the poses' places follow, and its diameters"
     )
     return (doubt,)
