@@ -37,7 +37,7 @@ class ReferenceSds:
 
     # of what is independent from frame to frame: the camera's reference position, its way until a
     # rolling shutter has read the target, and the target's way between the trajectory's epochs [m]
-    single_m: float
+    independent_m: float
     place_m: float  # of the trajectory, attitude included: an error that lasts for a while [m]
     # of lever arm and synchronisation, or of a static target's position [m]: the same in all frames
     common_m: float
@@ -45,7 +45,7 @@ class ReferenceSds:
     @property
     def total_m(self) -> float:
         """All three together [m]."""
-        return math.hypot(self.single_m, self.place_m, self.common_m)
+        return math.hypot(self.independent_m, self.place_m, self.common_m)
 
     @classmethod
     def along(
@@ -57,7 +57,7 @@ class ReferenceSds:
         """
         if position.cov_m2 is None or camera.cov_m2 is None:
             return None
-        single = float(direction @ camera.cov_m2 @ direction)
+        independent = float(direction @ camera.cov_m2 @ direction)
         whole = float(direction @ position.cov_m2 @ direction)
         between = 0.0
         if position.interpolation_m2 is not None:
@@ -66,7 +66,7 @@ class ReferenceSds:
         if position.common_m is not None:
             common = min(whole - between, float(np.sum((direction @ position.common_m) ** 2)))
         place = max(0.0, whole - between - common)
-        return cls(math.sqrt(single + between), math.sqrt(place), math.sqrt(common))
+        return cls(math.sqrt(independent + between), math.sqrt(place), math.sqrt(common))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

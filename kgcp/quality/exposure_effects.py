@@ -128,10 +128,14 @@ def _error_model(compared: Sequence[Comparison], unstated_m: FloatArray) -> Erro
             for sighting, otherwise in zip(sightings, unstated_m, strict=True)
         ]
     )
-    single = np.array([pair.sds.single_m if pair.sds else _UNSTATED_WHITE_M for pair in compared])
+    independent = np.array(
+        [pair.sds.independent_m if pair.sds else _UNSTATED_WHITE_M for pair in compared]
+    )
     place = np.array([pair.sds.place_m if pair.sds else _UNSTATED_LASTING_M for pair in compared])
     times = np.array([pair.attempt.time_s for pair in compared], dtype=np.float64)
     if not np.isfinite(times).all():  # without times it is not known which are neighbours
-        times = np.arange(float(len(single)))
-        return ErrorModel(measured**2 + single**2 + place**2, np.zeros_like(single), times)
-    return ErrorModel(measured**2 + single**2, place**2, times)
+        times = np.arange(float(len(independent)))
+        return ErrorModel(
+            measured**2 + independent**2 + place**2, np.zeros_like(independent), times
+        )
+    return ErrorModel(measured**2 + independent**2, place**2, times)

@@ -100,7 +100,7 @@ def test_residuals_are_measured_minus_reference() -> None:
         np.testing.assert_allclose(one.expected_px, _MIDDLE, atol=0.01)
         assert one.expected_radius_px == pytest.approx(0.45 * 2300.0 / above)
         assert one.sds is not None
-        assert one.sds.single_m == pytest.approx(0.04, rel=1e-3)
+        assert one.sds.independent_m == pytest.approx(0.04, rel=1e-3)
         assert one.sds.place_m == pytest.approx(0.03, rel=1e-3)
         assert one.sds.common_m == 0.0
         assert one.sds.total_m == pytest.approx(0.05, rel=1e-3)
@@ -293,6 +293,6 @@ def test_reference_distances_are_those_when_a_rolling_shutter_exposes_the_target
     after = np.array([pair.residual_m for pair in moving.measured])
     assert np.abs(before).max() > 0.01
     assert np.abs(after[1:-1]).max() < 0.001  # the first and the last have no frame beside them
-    sds = np.array([pair.sds.single_m for pair in moving.measured if pair.sds is not None])
+    sds = np.array([pair.sds.independent_m for pair in moving.measured if pair.sds is not None])
     assert np.all(np.abs(after) < 3.0 * sds)
     assert np.median(sds) < 0.011  # hardly more than the poses' own

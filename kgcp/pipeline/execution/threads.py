@@ -59,9 +59,11 @@ class _Limit:
 
         with self._lock:
             if self._blocks == 0:
-                self._undo.callback(cv2.setNumThreads, cv2.getNumThreads())
-                cv2.setNumThreads(0)
-                self._undo.enter_context(_controller().limit(limits=1))
+                with ExitStack() as undo:
+                    undo.callback(cv2.setNumThreads, cv2.getNumThreads())
+                    cv2.setNumThreads(0)
+                    undo.enter_context(_controller().limit(limits=1))
+                    self._undo = undo.pop_all()
             self._blocks += 1
 
     def leave(self) -> None:
