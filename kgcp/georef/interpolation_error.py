@@ -121,6 +121,7 @@ class _Sampling:
     def of(
         cls, time_s: FloatArray, knots: IndexArray, left: IndexArray, fraction: FloatArray
     ) -> _Sampling:
+        """Find where times lie, by the epoch before each and the share of the way to the next."""
         last = len(knots) - 1
         steps = np.diff(time_s[knots])
         interval = np.clip(np.searchsorted(knots, left, side="right") - 1, 0, last - 1)

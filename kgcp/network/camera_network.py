@@ -121,8 +121,9 @@ class CalibrationProblem:
     def with_unknowns(self, state: AdjustedNetwork, unknowns: NetworkUnknowns) -> AdjustedNetwork:
         """Return the adjustment of other unknowns; bends are those of the state, estimated anew."""
         cov, bends = state.network.observations.cov, state.network.bends
-        is_new = bends is None and not unknowns.is_rational
-        if is_new or state.unknowns.points is not unknowns.points:
+        # as in `adjusted`: by the discs' own covariances, terms of rational models would run away
+        keeps_cov = bends is not None or unknowns.is_rational
+        if not keeps_cov or state.unknowns.points is not unknowns.points:
             return self.adjusted(state.camera, state.estimate, unknowns)
         return self._settled(state.camera, state.estimate, unknowns, cov, bends)
 

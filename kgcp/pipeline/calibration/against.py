@@ -10,16 +10,16 @@ from pathlib import Path
 from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera
 from kgcp.io.flight.camera_table import read_camera_file
-from kgcp.io.formats.calibrations import Asker, read_calibration
+from kgcp.io.formats.calibrations import ErrorWords, read_calibration
 from kgcp.io.images.exif import read_frame_header
 from kgcp.pipeline.calibration.photographs import Photo
 
-_ASKER = Asker(
-    "the other calibration",
-    "but the photographs have",
-    "give a file that states it",
-    "give a file of one camera",
-    "convert it or write the values to a camera.toml",
+_WORDS = ErrorWords(
+    named_by="the other calibration",
+    other_size="but the photographs have",
+    no_size="give a file that states it",
+    several_cameras="give a file of one camera",
+    other_format="convert it or write the values to a camera.toml",
 )
 
 
@@ -43,7 +43,7 @@ def read_other(path: Path, photos: Sequence[Photo]) -> OtherCalibration:
     sizes = Counter(size for size in headers if size is not None)
     usual = max(sizes, key=lambda size: (sizes[size], size)) if sizes else (None, None)
     if path.suffix != ".toml":
-        return OtherCalibration(path.name, read_calibration(path, usual, asker=_ASKER))
+        return OtherCalibration(path.name, read_calibration(path, usual, words=_WORDS))
     camera, _ = read_camera_file(path)
     if sizes and usual != (camera.width, camera.height):
         raise KgcpError(

@@ -373,16 +373,14 @@ def _about_misses(results: Sequence[PhotoDiscs | PhotoMiss]) -> str:
     for result in results:
         if isinstance(result, PhotoMiss):
             misses.setdefault(result.reason, []).append(result)
-    reasons = sorted(misses, key=lambda reason: -len(misses[reason]))
+    is_any_found = any(isinstance(result, PhotoDiscs) for result in results)
     counts, remedies = [], []
-    for reason in reasons:
+    for reason in sorted(misses, key=lambda reason: -len(misses[reason])):
         first = misses[reason][0]
         example = f"{first.photo}: {first.detail}" if first.detail else first.photo
         counts.append(f"{len(misses[reason])} {reason} ({example})")
-        remedies.append(_REMEDIES[reason])
-    is_any_found = sum(map(len, misses.values())) < len(results)
-    if NamingProblem.TOO_FEW in misses and not is_any_found:
-        remedies[reasons.index(NamingProblem.TOO_FEW)] = _NONE_FOUND_REMEDY
+        is_unseen = reason == NamingProblem.TOO_FEW and not is_any_found
+        remedies.append(_NONE_FOUND_REMEDY if is_unseen else _REMEDIES[reason])
     return f"left out: {', '.join(counts)}; {'; '.join(remedies)}" if counts else ""
 
 

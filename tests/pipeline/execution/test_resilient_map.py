@@ -302,10 +302,17 @@ def test_a_worker_whose_parent_is_gone_ends_without_a_traceback(
     """A parent that is killed with results unread resets the pipe."""
 
     class ClosedPipe:
-        def send(self, _: object) -> None: ...
+        is_ready = is_read = False
+
+        def send(self, _: object) -> None:
+            self.is_ready = True
 
         def recv_bytes(self) -> bytes:
+            self.is_read = True
             raise error
 
     monkeypatch.setattr(signal, "signal", lambda *_: None)  # this process can be interrupted
-    _serve(ClosedPipe())
+    pipe = ClosedPipe()
+    _serve(pipe)
+    assert pipe.is_ready
+    assert pipe.is_read

@@ -48,24 +48,25 @@ FORMATS: Registry[Callable[[ForeignFile], Sequence[Entry]]] = Registry(
 
 
 @dataclass(frozen=True, slots=True)
-class Asker:
-    """Who names a calibration file, and what is to be done there: the words of messages."""
+class ErrorWords:
+    """What errors say about a calibration file, by where it is named."""
 
-    key: str  # that names the file
-    size: str  # who says how large frames are
-    add_size: str
-    choose_camera: str
-    write_values: str
+    named_by: str  # the key or option that names the file
+    other_size: str  # what its frame size contradicts
+    # remedies
+    no_size: str
+    several_cameras: str
+    other_format: str
 
 
-FLIGHT = Asker(
-    "[camera] file",
-    "but [camera] says",
-    "add width and height to [camera]",
-    "choose one with [camera] camera",
-    FORMATS.remedy,
+OF_FLIGHT = ErrorWords(
+    named_by="[camera] file",
+    other_size="but [camera] says",
+    no_size="add width and height to [camera]",
+    several_cameras="choose one with [camera] camera",
+    other_format=FORMATS.remedy,
 )
-"""A flight.toml."""
+"""For a file that flight.toml names."""
 
 
 def read_calibration(
@@ -73,19 +74,21 @@ def read_calibration(
     stated_size: tuple[int | None, int | None],
     form: str | None = None,
     camera: str | None = None,
-    asker: Asker = FLIGHT,
+    words: ErrorWords = OF_FLIGHT,
 ) -> Camera:
     """Read a calibration file of one of the `FORMATS`; docs/foreign_files.md has their conversions.
 
     Parameters
     ----------
     stated_size : tuple of int or None
-        Width and height [px] that `asker` gives beside the file: needed where the file is silent,
-        else they must agree.
+        Width and height [px] that are known beside the file: needed where the file is silent, else
+        they must agree.
     form : str or None
         Name of the format; None: the content tells.
     camera : str or None
         Name of the camera where the file has several.
+    words : ErrorWords
+        Of errors.
 
     Raises
     ------
@@ -93,17 +96,19 @@ def read_calibration(
         If the file is missing, is of no known format, lacks the size or the camera, or holds a
         model that `Camera` cannot represent exactly; it names the term.
     """
-    file = ForeignFile(path, asker.key)
-    read = replace(FORMATS, remedy=asker.write_values).reader(file, form)
-    entry = _chosen(file, read(file), camera, asker)
-    width, height = _agreed_size(file, entry, stated_size, asker)
+    file = ForeignFile(path, words.named_by)
+    read = replace(FORMATS, remedy=words.other_format).reader(file, form)
+    entry = _chosen(file, read(file), camera, words)
+    width, height = _agreed_size(file, entry, stated_size, words)
     try:
         return entry.convert(width, height)
     except SettingError as error:
         raise KgcpError(f"{path}: {error}") from None
 
 
-def _chosen(file: ForeignFile, entries: Sequence[Entry], camera: str | None, asker: Asker) -> Entry:
+def _chosen(
+    file: ForeignFile, entries: Sequence[Entry], camera: str | None, words: ErrorWords
+) -> Entry:
     """Return the camera of that name, or the only one."""
     if not entries:
         raise file.error("holds no camera", "export the calibration again")
@@ -111,7 +116,7 @@ def _chosen(file: ForeignFile, entries: Sequence[Entry], camera: str | None, ask
     if camera is None:
         if len(entries) == 1:
             return entries[0]
-        raise file.error(f"holds the cameras {_listed(names)}", asker.choose_camera)
+        raise file.error(f"holds the cameras {_listed(names)}", words.several_cameras)
     chosen = [entry for entry in entries if entry.name == camera]
     if len(chosen) != 1:
         count = "several cameras" if chosen else "no camera"
@@ -127,12 +132,12 @@ def _listed(names: Sequence[str], most: int = 8) -> str:
 
 
 def _agreed_size(
-    file: ForeignFile, entry: Entry, stated: tuple[int | None, int | None], asker: Asker
+    file: ForeignFile, entry: Entry, stated: tuple[int | None, int | None], words: ErrorWords
 ) -> tuple[int, int]:
     width, height = stated
     if entry.size is None:
         if width is None or height is None:
-            raise file.error("has no image size", asker.add_size)
+            raise file.error("has no image size", words.no_size)
         return width, height
     found_width, found_height = entry.size
     if min(entry.size) < 1:
@@ -140,7 +145,7 @@ def _agreed_size(
     size = (width or found_width, height or found_height)
     if size != entry.size and not (entry.is_relative and _same_shape(size, entry.size)):
         raise file.error(
-            f"is for {found_width} x {found_height} px, {asker.size} {size[0]} x {size[1]}",
+            f"is for {found_width} x {found_height} px, {words.other_size} {size[0]} x {size[1]}",
             "use the calibration of this frame size",
         )
     return size
