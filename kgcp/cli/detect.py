@@ -36,7 +36,7 @@ _DEFAULTS = DetectSettings()
     "frame_patterns",
     metavar="PATTERN",
     multiple=True,
-    help="Examine only frames whose path below the frames folder matches, such as '*_00??.JPG';"
+    help='Examine only frames whose path below the frames folder matches, such as "*_00??.JPG";'
     " may be repeated. The table then has these frames alone.",
 )
 @click.option(

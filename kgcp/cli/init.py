@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -89,12 +90,13 @@ def command(
     _print_page(draft, written)
     needs_edit = any(not gap.is_assumed for gap in draft.gaps)
     first = "fill in what is MISSING there, then " if needs_edit else ""
-    click.echo(f"next: {first}kgcp check {_quoted(flight)}", err=True)
+    click.echo(f"next: {first}kgcp check {quoted(flight)}", err=True)
 
 
-def _quoted(flight: Path) -> str:
-    """Return a folder as it is typed."""
-    return f'"{flight}"' if " " in str(flight) else str(flight)
+def quoted(flight: Path) -> str:
+    """Return a folder as it is typed, also where shells take & and brackets for their own."""
+    text = str(flight)
+    return text if re.fullmatch(r"[\w.:/\\~+-]+", text) else f'"{text}"'
 
 
 def _print_json(draft: FlightDraft, written: list[Path]) -> None:

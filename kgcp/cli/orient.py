@@ -34,7 +34,7 @@ _FEW_FRAMES = 3  # that are named
     "patterns",
     metavar="PATTERN",
     multiple=True,
-    help="Orient these frames, for example 'west/*'; may be repeated.  [default: all]",
+    help='Orient these frames, for example "west/*"; may be repeated.  [default: all]',
 )
 @click.option(
     "--min-points",

@@ -19,6 +19,7 @@ from benchmarks.first_flight.bare_folders import (
     write_static_folder,
 )
 from kgcp.cli import main
+from kgcp.cli.init import quoted
 from kgcp.geometry.arrays import GreyArray
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight, read_flight
@@ -394,3 +395,9 @@ def test_names_of_files_are_no_lines_of_the_file(bare: Path, tmp_path: Path) -> 
     assert text.count("\n[vehicle]") == 1
     assert "\x1b" not in text
     assert read_flight(folder).camera.fx == pytest.approx(PLAN.settings.camera.fx)
+
+
+@pytest.mark.parametrize("folder", ["north & south", "a&b", "flight(2)"])
+def test_folders_are_quoted_where_shells_need_it(folder: str) -> None:
+    assert quoted(Path(folder)) == f'"{folder}"'
+    assert quoted(Path("/flights/Höhe_7.1~a")) == "/flights/Höhe_7.1~a"

@@ -137,7 +137,7 @@ def matching_frames(frames: Sequence[str], patterns: Sequence[str]) -> list[str]
             some = ", ".join(frames[:_SHOWN_FRAMES])
             raise KgcpError(
                 f"{pattern!r} matches none of {len(frames)} frames ({some}, …); give a pattern of"
-                " their paths below the frames folder, such as '*_00??.JPG'",
+                ' their paths below the frames folder, such as "*_00??.JPG"',
                 option="frames",
             )
     return [frame for frame in frames if is_chosen(frame, patterns)]
