@@ -18,6 +18,7 @@ from typing import Any, TextIO
 import click
 
 from kgcp import __version__
+from kgcp.cli.shells import as_meant
 from kgcp.errors import KgcpError, KgcpWarning, SettingError
 from kgcp.pipeline.execution.threads import use_one_thread_each
 
@@ -106,7 +107,12 @@ class Program(click.Group):
         _print_anything()
         gc.set_threshold(_OBJECTS)
         atexit.register(gc.freeze)  # 0.2 s of searching what ends with the process anyway
-        return super().main(*args, **kwargs)
+        # Else click replaces every pattern on Windows, also that of --frames, however it is quoted.
+        return super().main(*args, windows_expand_args=False, **kwargs)
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments as they were meant in the shell."""
+        return super().parse_args(ctx, as_meant(args))
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
         """Return the commands in the order of use."""

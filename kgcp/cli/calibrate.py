@@ -11,6 +11,7 @@ from kgcp.cli.detect_log import log_to_stderr, stopping
 from kgcp.cli.options import (
     json_option,
     log_json_option,
+    photo_paths,
     quiet_option,
     restart_option,
     unit_option,
@@ -29,9 +30,7 @@ FORMATS = ("opencv", "ros", "metashape", "colmap", "opensfm", "pix4d", "opf", "m
 
 
 @click.command()
-@click.argument(
-    "photos", metavar="PHOTOS…", type=click.Path(path_type=Path), nargs=-1, required=True
-)
+@click.argument("photos", metavar="PHOTOS…", callback=photo_paths, nargs=-1, required=True)
 @click.option(
     "--field",
     "field_text",

@@ -33,6 +33,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from kgcp.cli.shells import paths_of
+
 if TYPE_CHECKING:
     from kgcp.io.images.remote import StoredFolder
 
@@ -43,18 +45,35 @@ def _place(
     value: str | None,
 ) -> Path | StoredFolder | None:
     """Distinguish the URL of a folder, `s3://…`, `gs://…` or `file://…`, from a path."""
-    if value is None or "://" not in value:
-        return None if value is None else Path(value)
-    from kgcp.io.images.remote import parsed_url
-
-    return parsed_url(value)
+    return None if value is None else _place_of(value)
 
 
 def _places(
-    context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
+    context: click.Context,  # noqa: ARG001 - click's signature
+    parameter: click.Parameter,  # noqa: ARG001
+    values: tuple[str, ...],
 ) -> tuple[Path | StoredFolder, ...]:
-    places = (_place(context, parameter, value) for value in values or (".",))
-    return tuple(place for place in places if place is not None)
+    places: list[Path | StoredFolder] = []
+    for value in values or (".",):
+        places += [_place_of(value)] if "://" in value else paths_of(value)
+    return tuple(places)
+
+
+def _place_of(text: str) -> Path | StoredFolder:
+    if "://" not in text:
+        return Path(text)
+    from kgcp.io.images.remote import parsed_url
+
+    return parsed_url(text)
+
+
+def photo_paths(
+    context: click.Context,  # noqa: ARG001 - click's signature
+    parameter: click.Parameter,  # noqa: ARG001
+    values: tuple[str, ...],
+) -> tuple[Path, ...]:
+    """Return the files and folders that arguments name."""
+    return tuple(path for value in values for path in paths_of(value))
 
 
 flight_argument = click.argument(
