@@ -5,15 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Executor, Future
+from contextlib import suppress
 from enum import Enum, auto
 from itertools import islice
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
 from kgcp.pipeline.execution.signals import defer_interrupts
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+_LONGEST_WAIT_S = 0.5  # during which Windows hears no Ctrl-C, before Python 3.13
 
 
 def usable_cores() -> int:
@@ -90,7 +93,7 @@ def resilient_map(
             submit(item)
         if not pending:
             break
-        future = done.get()
+        future = _next(done)
         item = pending.pop(future)
         if isinstance(future.exception(), Lost):
             suspects.append(item)
@@ -98,6 +101,13 @@ def resilient_map(
             yield item, future.result()
     for item in suspects:
         submit(item)
-        future = done.get()
+        future = _next(done)
         error = future.exception()
         yield item, error.loss if isinstance(error, Lost) else future.result()
+
+
+def _next(done: SimpleQueue[Future[Result]]) -> Future[Result]:
+    """Return the call that ends next; a signal's exception may end the wait."""
+    while True:
+        with suppress(Empty):
+            return done.get(timeout=_LONGEST_WAIT_S)

@@ -7,13 +7,15 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterator
-from concurrent.futures import Executor
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
 from contextlib import closing
 from functools import partial
 from itertools import count, islice
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -247,6 +249,31 @@ def test_a_map_that_is_closed_early_does_not_wait(tmp_path: Path) -> None:
         list(resilient_map(partial(wait_forever, tmp_path), stop(), executor, 1))
     assert time.monotonic() - start_s < 60.0
     wait_until_gone(workers_in(tmp_path))
+
+
+class SlowExecutor(Executor):
+    """Ends a call long after an interrupt should have been heard."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:  # noqa: ANN401, ARG002 - the base class's
+        future: Future[Any] = Future()
+        end = threading.Timer(3.0 * LIMIT_S, future.set_result, [None])
+        end.daemon = True
+        end.start()
+        return future
+
+
+@pytest.mark.usefixtures("sigint_raises")
+def test_an_interrupt_is_heard_soon_where_it_does_not_end_a_wait() -> None:
+    """As on Windows before Python 3.13, and here if another thread gets the signal."""
+
+    def interrupt() -> None:
+        signal.pthread_kill(threading.get_ident(), signal.SIGINT)
+
+    start_s = time.monotonic()
+    threading.Timer(0.1, interrupt).start()
+    with pytest.raises(KeyboardInterrupt):
+        list(resilient_map(abs, (1,), SlowExecutor(), 1))
+    assert time.monotonic() - start_s < LIMIT_S
 
 
 def workers_in(folder: Path) -> list[int]:
