@@ -14,7 +14,7 @@ from kgcp.errors import KgcpError, Rejection
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.io.files.atomic import write_bytes
+from kgcp.io.files.atomic import remove, write_bytes
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.images.frames import read_grey
@@ -168,7 +168,7 @@ class FlightBias:
         for name, data in files.items():
             write_bytes(folder / name, data)
         for name in set(FIGURE_FILES.values()) - files.keys():
-            (folder / name).unlink(missing_ok=True)  # of an earlier run: not of these numbers
+            remove(folder / name)  # of an earlier run: not of these numbers
         paths = (table, *(folder / name for name in files))
         return Report(content.summary, content.verdict, paths)
 

@@ -27,7 +27,7 @@ from kgcp.io.exporters import (
 from kgcp.io.exporters.formats import FORMATS
 from kgcp.io.exporters.points import MapPoints
 from kgcp.io.exporters.weights import with_floors
-from kgcp.io.files.atomic import write_all
+from kgcp.io.files.atomic import remove, write_all
 
 _WRITERS: Mapping[str, ModuleType] = {
     "csv": plain_csv,
@@ -79,7 +79,7 @@ def _remove_stale(folder: Path, patterns: tuple[str, ...], written: set[Path]) -
     for pattern in patterns:
         for path in folder.glob(pattern.strip("[]")):
             if path not in written:
-                path.unlink()
+                remove(path)
 
 
 def not_renewed(folder: Path, written: Iterable[Path]) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from kgcp.errors import KgcpError
+from kgcp.io.files.portable import replace
 
 _WRITERS = 8  # at a time: a disk confirms several files as quickly as one
 
@@ -22,6 +23,8 @@ def whole_file(path: Path) -> Iterator[Path]:
 
     Raises
     ------
+    KgcpError
+        If the file that has the name is open in a program that keeps it, as on Windows.
     OSError
         If the file does not exist at the end, or cannot be renamed.
     """
@@ -32,11 +35,36 @@ def whole_file(path: Path) -> Iterator[Path]:
         yield temporary
         with temporary.open("r+b") as written:  # Windows flushes only what may be written
             os.fsync(written.fileno())
-        temporary.replace(path)
+        try:
+            replace(temporary, path)
+        except PermissionError as error:
+            raise _in_use(path) from error
     except BaseException:
         with suppress(OSError):  # it may not exist, or its folder be gone
             temporary.unlink()
         raise
+
+
+def remove(path: Path) -> None:
+    """Delete a file if it is there.
+
+    Raises
+    ------
+    KgcpError
+        If it cannot be deleted.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except PermissionError as error:
+        raise _in_use(path) from error
+    except OSError as error:
+        raise KgcpError(f"{path}: cannot be deleted ({error.strerror}); delete it") from error
+
+
+def _in_use(path: Path) -> KgcpError:
+    return KgcpError(
+        f"{path}: is open in another program, or protected; close it there, then repeat the command"
+    )
 
 
 def write_bytes(path: Path, content: bytes) -> None:

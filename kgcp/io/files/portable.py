@@ -10,6 +10,7 @@ import errno
 import os
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
@@ -20,6 +21,7 @@ OPEN_FLAGS: int = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_CLOEXEC
 """For `os.open`, as far as the system has them: no links, not for child processes, no new lines."""
 _BEYOND = 1 << 40  # byte that Windows locks: those that are written stay readable
 _BYTES_PER_KB = 1024
+_PAUSES_S = (0.05, 0.1, 0.2, 0.4, 0.8)  # before what Windows has refused is tried again
 
 
 def _module(name: str) -> Any:  # noqa: ANN401 - a module of one system, with its own attributes
@@ -51,6 +53,27 @@ def lock(descriptor: int) -> None:
         raise BlockingIOError(errno.EAGAIN, error.strerror) from error
     finally:
         os.lseek(descriptor, position, os.SEEK_SET)
+
+
+def replace(source: Path, target: Path) -> None:
+    """Rename a file or folder, to a name that another file may have.
+
+    Windows refuses that while a program has one of the two open; scanners of viruses have new files
+    open for a moment.
+
+    Raises
+    ------
+    OSError
+        `PermissionError` if one of them stays open, or is protected.
+    """
+    for pause_s in _PAUSES_S:
+        try:
+            source.replace(target)
+        except PermissionError:
+            time.sleep(pause_s)
+        else:
+            return
+    source.replace(target)
 
 
 def peak_memory_mb() -> dict[str, float]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
-from kgcp.io.files.atomic import write_bytes
+from kgcp.io.files.atomic import remove, write_bytes
 from kgcp.io.tables.columns import BOOLEAN, TEXT, TIME, Column, row_of, time_cell
 from kgcp.io.tables.parquet import write_table
 from kgcp.quality.advice import advice, rms_m
@@ -50,7 +50,7 @@ def write_consistency(
 def remove_consistency(folder: Path) -> None:
     """Remove both files of an earlier export: they are not of the points that are written now."""
     for path in _paths(folder):
-        path.unlink(missing_ok=True)
+        remove(path)
 
 
 def _paths(folder: Path) -> tuple[Path, Path]:

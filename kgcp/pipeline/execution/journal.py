@@ -192,7 +192,8 @@ class Journal(Generic[Result]):
             self._reader.close()
             self._writer.close()
             if self._is_left:
-                self._path.unlink(missing_ok=True)
+                with suppress(PermissionError):  # the next run finds all results, and deletes it
+                    self._path.unlink(missing_ok=True)
 
     def __iter__(self) -> Iterator[str]:
         """Yield the keys of all results."""

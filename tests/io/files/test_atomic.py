@@ -1,11 +1,12 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from kgcp.errors import KgcpError
-from kgcp.io.files.atomic import whole_file, write_all, write_bytes
+from kgcp.io.files.atomic import remove, whole_file, write_all, write_bytes
 
 
 def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
@@ -52,3 +53,62 @@ def test_many_files_are_written_or_the_one_that_cannot_be_is_named(tmp_path: Pat
     with pytest.raises(KgcpError, match=r"7\.txt: cannot be written"):
         write_all({tmp_path / f"{number}.txt": b"" for number in range(9)})
     assert not [*tmp_path.glob(".*.part")]
+
+
+class OpenFile:
+    """A file that Windows keeps while a program has it open, for so many attempts."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, path: Path, attempts: float) -> None:
+        self.path, self.attempts = path, attempts
+        monkeypatch.setattr("kgcp.io.files.portable.time.sleep", lambda _: None)
+        for name, is_its_own in (("unlink", True), ("replace", False)):
+            self._refuse(monkeypatch, name, getattr(Path, name), is_its_own=is_its_own)
+
+    def _refuse(
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        name: str,
+        does: Callable[..., object],
+        *,
+        is_its_own: bool,
+    ) -> None:
+        def refused(path: Path, *args: Path, **options: bool) -> object:
+            touched = path if is_its_own else args[0]
+            if touched == self.path and self.path.exists():
+                self.attempts -= 1
+                if self.attempts >= 0:
+                    raise PermissionError(13, "Access is denied", str(touched))
+            return does(path, *args, **options)
+
+        monkeypatch.setattr(Path, name, refused)
+
+
+def test_a_file_that_is_open_elsewhere_is_told_and_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "kgcps.csv"
+    write_bytes(path, b"old")
+    OpenFile(monkeypatch, path, float("inf"))
+    text = r"kgcps\.csv: is open in another program, or protected; close it there, then repeat"
+    with pytest.raises(KgcpError, match=text):
+        write_bytes(path, b"new")
+    with pytest.raises(KgcpError, match=text):
+        remove(path)
+    assert [(each.name, each.read_bytes()) for each in tmp_path.iterdir()] == [(path.name, b"old")]
+
+
+def test_a_file_that_is_open_for_a_moment_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "kgcps.csv"
+    write_bytes(path, b"old")
+    OpenFile(monkeypatch, path, 2)
+    write_bytes(path, b"new")
+    assert path.read_bytes() == b"new"
+
+
+def test_what_cannot_be_deleted_is_told(tmp_path: Path) -> None:
+    remove(tmp_path / "not there")
+    (tmp_path / "a").mkdir()
+    with pytest.raises(KgcpError, match=r"a: cannot be deleted \(Is a directory\); delete it"):
+        remove(tmp_path / "a")
