@@ -22,6 +22,7 @@ from PIL.TiffImagePlugin import IFDRational
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.io.files.csv_text import csv_text
+from kgcp.io.files.portable import replace
 from kgcp.io.files.time_text import format_time
 from kgcp.io.flight.camera_file import camera_lines
 from kgcp.io.flight.target_table import target_lines
@@ -162,11 +163,13 @@ def new_folder(out: Path) -> Iterator[Path]:
     Raises
     ------
     KgcpError
-        If `out` is not empty or cannot be written.
+        If `out` is not empty, cannot be written, or is the current folder.
     """
     out = out.resolve()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise KgcpError(f"{out}: is not empty; choose a new folder or empty it first")
+    if out == Path.cwd():  # Windows keeps it, and a shell elsewhere would see an empty folder
+        raise KgcpError(f"{out}: is the current folder; choose a new folder")
     partial = out.with_name(f".{out.name}.part")
     try:
         shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed
@@ -174,7 +177,7 @@ def new_folder(out: Path) -> Iterator[Path]:
         yield partial
         if out.exists():
             out.rmdir()
-        partial.replace(out)
+        replace(partial, out)
     except OSError as error:
         raise KgcpError(f"{out}: cannot be written ({error}); choose another folder") from error
     finally:

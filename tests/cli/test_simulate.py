@@ -63,6 +63,16 @@ def test_a_used_folder_ends_in_one_line(tmp_path: Path) -> None:
     assert "is not empty" in result.stderr
 
 
+def test_the_current_folder_is_refused_before_anything_is_rendered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(main, ["simulate", ".", "--frames", "1", "--jobs", "1"])
+    assert result.exit_code == 1
+    assert "is the current folder; choose a new folder" in result.stderr
+    assert tmp_path.exists()
+
+
 EFFECTS: dict[str, Any] = {
     "gain": (1.2, 2.0),
     "shadow": 0.6,
