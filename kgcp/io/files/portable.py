@@ -49,7 +49,7 @@ def lock(descriptor: int) -> None:
     os.lseek(descriptor, _BEYOND, os.SEEK_SET)
     try:
         msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-    except OSError as error:
+    except PermissionError as error:  # any other error: the drive has no locks
         raise BlockingIOError(errno.EAGAIN, error.strerror) from error
     finally:
         os.lseek(descriptor, position, os.SEEK_SET)
