@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from kgcp.georef.unix_time import date_of
 
 _DAY_S = 86400.0
 _TWO_WEEKS_S = 14 * _DAY_S  # longer than any seconds of the week, with a flight over its end
@@ -17,13 +17,13 @@ def gps_count_remedy(frames_s: float, trajectory_s: float) -> str | None:
     if 0.0 <= trajectory_s < _TWO_WEEKS_S <= frames_s:
         return (
             "the trajectory's times are seconds of a GPS week: give [vehicle] date ="
-            f' {_date(frames_s):%Y-%m-%d}, the day of its first epoch, and time_system = "gps" in'
+            f' {date_of(frames_s):%Y-%m-%d}, the day of its first epoch, and time_system = "gps" in'
             " flight.toml"
         )
     if 0.0 <= frames_s < _TWO_WEEKS_S <= trajectory_s:
         return (
             "the frames' times are seconds of a GPS week: write them as UTC,"
-            f" {_date(trajectory_s):%Y-%m-%dT%H:%M:%SZ}, and run 'kgcp detect' again"
+            f" {date_of(trajectory_s):%Y-%m-%dT%H:%M:%SZ}, and run 'kgcp detect' again"
         )
     for whose, behind_s in (
         ("trajectory's", frames_s - trajectory_s),
@@ -35,7 +35,3 @@ def gps_count_remedy(frames_s: float, trajectory_s: float) -> str | None:
                 " take off the leap seconds (18 since 2017), to make them Unix seconds"
             )
     return None
-
-
-def _date(unix_s: float) -> datetime:
-    return datetime.fromtimestamp(unix_s, UTC)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Self
 
@@ -18,6 +17,7 @@ from kgcp.georef.gps_counts import gps_count_remedy
 from kgcp.georef.interpolation_error import interpolation_errors
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.trajectory import ENU_FROM_NED, Coverage, Motion, States, Trajectory, body_to_ned
+from kgcp.georef.unix_time import date_of
 from kgcp.settings import VehicleSettings
 from kgcp.targets.plain import AnyTarget, PlainTarget
 
@@ -250,7 +250,7 @@ def _no_overlap(vehicle: Vehicle, time_s: FloatArray) -> str:
 
 
 def _utc(unix_s: float) -> str:
-    moment = datetime.fromtimestamp(unix_s, UTC).replace(tzinfo=None)
+    moment = date_of(unix_s).replace(tzinfo=None)
     return f"{moment.isoformat(timespec='milliseconds')}Z"
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from kgcp.errors import KgcpWarning
 from kgcp.geometry.arrays import FloatArray
+from kgcp.georef.unix_time import date_of
 
 WEEK_S = 604800.0
 _DAY_S = 86400.0
@@ -109,7 +110,7 @@ def first_day_near(seconds: float, unix_s: float, system: TimeSystem) -> date:
         clock_s += unix_s - float(unix_from_gps(np.array(unix_s)))
     within = seconds % WEEK_S
     weeks = round((clock_s - _GPS_START_S - within) / WEEK_S)
-    return datetime.fromtimestamp(_GPS_START_S + weeks * WEEK_S + within, UTC).date()
+    return date_of(_GPS_START_S + weeks * WEEK_S + within).date()
 
 
 def weekday(seconds: float) -> str:

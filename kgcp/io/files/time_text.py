@@ -6,8 +6,8 @@ import re
 from datetime import UTC, datetime, timedelta
 
 from kgcp.errors import SettingError
+from kgcp.georef.unix_time import EPOCH, date_of
 
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _SECOND = timedelta(seconds=1)
 _EARLIEST_S = datetime(1, 1, 3, tzinfo=UTC).timestamp()
 _LATEST_S = datetime(9999, 12, 29, tzinfo=UTC).timestamp()
@@ -58,7 +58,7 @@ def parse_time(text: str) -> float:
         raise SettingError("time", f"{text!r} is not a time", _REMEDY) from None
     if moment.tzinfo is None:
         raise SettingError("time", f"{text!r} names no time zone", _REMEDY)
-    return _in_calendar((moment - _EPOCH) / _SECOND, f"{text!r} is out of range")
+    return _in_calendar((moment - EPOCH) / _SECOND, f"{text!r} is out of range")
 
 
 def half_of_time(text: str) -> str | None:
@@ -76,11 +76,6 @@ def names_zone(text: str) -> bool | None:
         return datetime.fromisoformat(text).tzinfo is not None
     except ValueError:
         return None
-
-
-def date_of(unix_s: float) -> datetime:
-    """Return Unix seconds as a UTC date, rounded to the microsecond."""
-    return _EPOCH + timedelta(microseconds=round(unix_s * 1e6))
 
 
 def format_time(unix_s: float) -> str:

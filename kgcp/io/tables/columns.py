@@ -15,7 +15,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.io.files.time_text import date_of
+from kgcp.georef.unix_time import date_of
 
 Row = Mapping[str, object]
 Record = TypeVar("Record")

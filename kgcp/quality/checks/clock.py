@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from datetime import UTC, datetime
 from itertools import product
 
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.gps_counts import gps_count_remedy
+from kgcp.georef.unix_time import date_of
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
 
 _WEEK_S = 604_800.0
@@ -178,7 +178,7 @@ def _whole_days(times: FloatArray, first: float, last: float) -> int | None:
 
 def time_span(times_s: FloatArray) -> str:
     """Return the first and the last of some times, Unix UTC [s], in words."""
-    first, last = (datetime.fromtimestamp(float(t), UTC) for t in (times_s.min(), times_s.max()))
+    first, last = (date_of(float(t)) for t in (times_s.min(), times_s.max()))
     end = last.strftime("%H:%M:%S" if last.date() == first.date() else "%Y-%m-%d %H:%M:%S")
     return f"{first:%Y-%m-%d %H:%M:%S} to {end}"
 

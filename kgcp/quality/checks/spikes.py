@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from functools import cached_property
 
 import numpy as np
 
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.georef.trajectory import Motion
+from kgcp.georef.unix_time import date_of
 from kgcp.quality.checks.doubt import Cause, Doubt, mild
 
 _SMALLEST_M = 1.5  # coordinates of five decimals in degrees have steps of 1.1 m
@@ -187,4 +187,4 @@ def _doubt(found: Sequence[_Excursion], motion: Motion) -> Doubt:
 
 
 def _utc(unix_s: float) -> str:
-    return f"{datetime.fromtimestamp(unix_s, UTC):%Y-%m-%d %H:%M:%S.%f}"
+    return f"{date_of(unix_s):%Y-%m-%d %H:%M:%S.%f}"
