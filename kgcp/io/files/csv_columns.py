@@ -16,6 +16,7 @@ import numpy as np
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
+from kgcp.io.files.csv_text import is_separator_line
 from kgcp.io.files.safe_read import is_sound, read_lines
 
 SEPARATOR_REMEDY = "save it with commas between the cells and points in the numbers"
@@ -144,6 +145,8 @@ def read_csv_columns(
     places = [header.index(name) for name in names]
     lines, text_cells, numbers = [], [], array("d")
     for line, cells in rows:
+        while len(cells) > len(header) and not cells[-1].strip():
+            cells.pop()  # a spreadsheet has as many cells in some lines as in the longest one
         if len(cells) != len(header):
             raise KgcpError(
                 f"{path}, line {line}: has {len(cells)} cells, the first line has {len(header)};"
@@ -216,7 +219,7 @@ def _own_names(header: Sequence[str], layout: CsvLayout, where: str) -> list[str
 
 def _read_rows(path: Path, toml_key: str, separator: str) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows that are not blank, with their line numbers."""
-    lines = read_lines(path, toml_key)
+    lines = _without_separator_line(read_lines(path, toml_key))
     if separator == " ":
         rows = ((number, line.split()) for number, line in enumerate(lines, start=1))
         yield from ((number, cells) for number, cells in rows if cells)
@@ -228,15 +231,26 @@ def _read_rows(path: Path, toml_key: str, separator: str) -> Iterator[tuple[int,
         raise KgcpError(f"{path}: is not a readable CSV file ({error}); repair it") from error
 
 
+def _without_separator_line(lines: Iterator[str]) -> Iterator[str]:
+    """Yield the lines, the first one blank if it names the separator: others keep their numbers."""
+    first = next(lines, "")
+    yield "\n" if is_separator_line(first) else first
+    yield from lines
+
+
 def _number(text: str, where: str, decimal: str) -> float:
-    if decimal != ".":
-        text = text.replace(decimal, ".")
+    text = text.strip()
     try:
-        value = float(text)
+        value = float(text.replace(decimal, "."))
     except ValueError:
         value = float("nan")
-    if _DECIMAL_COMMA.fullmatch(text.strip()):
-        raise KgcpError(f"{where} is {text.strip()!r}, with a decimal comma; write a point")
+    if decimal == "." and _DECIMAL_COMMA.fullmatch(text):
+        raise KgcpError(f"{where} is {text!r}, with a decimal comma; write a point")
+    if decimal == "," and "." in text:  # 1.234 would be read as 1,234
+        raise KgcpError(
+            f"{where} is {text!r}, with a point, where decimals have a comma; leave out points"
+            " between thousands"
+        )
     if not is_sound(value):
-        raise KgcpError(f"{where} is {text.strip()!r}; give a finite number")
+        raise KgcpError(f"{where} is {text!r}; give a finite number")
     return value

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from kgcp.io.files.csv_columns import SEPARATORS, CsvLayout
+from kgcp.io.files.csv_text import is_separator_line
 from kgcp.io.files.safe_read import is_sound
 from kgcp.io.files.sniff import ForeignFile
 
@@ -73,7 +74,7 @@ def sniff_table(file: ForeignFile, known: Mapping[str, Sequence[str]]) -> Sniffe
     return SniffedTable(
         CsvLayout(
             separator,
-            _decimal(others, separator),
+            _decimal(others, separator, [*places.values()]),
             {ours: theirs for ours, theirs in columns.items() if ours != theirs},
         ),
         {ours: others[0][place] for ours, place in places.items() if place < len(others[0])},
@@ -87,7 +88,8 @@ def _first_rows(file: ForeignFile) -> list[str]:
     lines = text.splitlines()
     if not text.endswith("\n"):
         lines = lines[: max(2, len(lines) - 1)]  # the last one may be cut
-    rows = [line for line in lines if line.strip()][: _SAMPLE + 1]
+    rows = [line for line in lines if line.strip()]
+    rows = rows[1 if rows and is_separator_line(rows[0]) else 0 :][: _SAMPLE + 1]
     return [] if not rows or rows[0].lstrip()[0] in "#%<{" else rows
 
 
@@ -116,8 +118,10 @@ def _columns(header: Sequence[str], known: Mapping[str, Sequence[str]]) -> dict[
     return {name: exact[name] for name in known if name in exact}
 
 
-def _decimal(rows: Sequence[Sequence[str]], separator: str) -> str:
+def _decimal(rows: Sequence[Sequence[str]], separator: str, places: Sequence[int]) -> str:
+    """Return the decimal mark of known columns; others may be lists or texts."""
     if separator == ",":
         return "."
-    has_comma = any(_COMMA_NUMBER.fullmatch(cell) for row in rows for cell in row)
+    cells = (row[place] for row in rows for place in places if place < len(row))
+    has_comma = any(map(_COMMA_NUMBER.fullmatch, cells))
     return "," if has_comma else "."

@@ -18,6 +18,7 @@ import numpy as np
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
+from kgcp.io.files.csv_text import is_separator_line
 from kgcp.io.files.safe_read import is_sound, read_bytes, require_file
 
 _ENTITY = re.compile(r"<!\s*ENTITY")
@@ -50,11 +51,11 @@ class ForeignFile:
 
     @property
     def first_line(self) -> str:
-        """The first line that is neither blank nor a comment (#); empty if it is not text."""
+        """The first line with content, no comment (#) or `sep=;`; empty if it is not text."""
         if b"\0" in self.head:
             return ""
         rows = self.head.decode("utf-8-sig", errors="replace").splitlines()
-        return next((row for row in rows if row.strip() and not row.startswith("#")), "")
+        return next((row for row in rows if _has_content(row)), "")
 
     @cached_property
     def text(self) -> str:
@@ -116,6 +117,10 @@ class ForeignFile:
             kind = "a finite number" if count == 1 else f"{count} finite numbers"
             raise self.error_at(where, f"holds {shown!r} instead of {kind}")
         return values
+
+
+def _has_content(line: str) -> bool:
+    return bool(line.strip()) and not line.startswith("#") and not is_separator_line(line)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,9 +24,12 @@ def sniffed(path: Path, text: str) -> SniffedTable | None:
         ("GPST,E,N\n1.5,2.5,3.5\n", ",", "."),
         ("GPST;E;N\n1,5;2,5;3,5\n", ";", ","),
         ("GPST;E;N\n1.5;2.5;3.5\n", ";", "."),
+        ("GPST;E;N;used\n1.5;2.5;3.5;4,12\n", ";", "."),
         ("GPST\tE\tN\n1,5\t2,5\t3,5\n", "\t", ","),
         ("GPST   E  N\n 1.5  2.5   3.5\n", " ", "."),
         ('"GPST";"E";"N"\n"1,5";"2,5";"3,5"\n', ";", ","),
+        ("\ufeffsep=;\r\nGPST;E;N\r\n1,5;2,5;3,5\r\n", ";", ","),
+        ("GPST;E;N\n1,5;2,5;3,5;;\n;;;;\n", ";", ","),
     ],
 )
 def test_what_is_sniffed_is_read(tmp_path: Path, text: str, separator: str, decimal: str) -> None:
@@ -71,3 +74,19 @@ def test_groups_of_a_trajectory_are_whole_or_absent(tmp_path: Path) -> None:
     assert table.is_geographic
     assert not table.has_attitude
     assert table.table.layout.columns == {"x": "lon", "y": "lat", "z": "h"}
+
+
+def test_a_line_for_excel_is_no_header_and_is_counted(tmp_path: Path) -> None:
+    path = tmp_path / "frames.csv"
+    path.write_text("sep=,\nframe,time\na.jpg,1\nb.jpg,2,x\n", encoding="utf-8")
+    assert ForeignFile(path, "").first_line == "frame,time"
+    with pytest.raises(KgcpError, match=r"line 4: has 3 cells, the first line has 2"):
+        read_csv_columns(path, ("frame", "time"), (), (), "")
+
+
+@pytest.mark.parametrize("number", ["689.591", "5.336.213,5"])
+def test_points_between_thousands_are_not_taken_for_decimals(tmp_path: Path, number: str) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(f"time;x\n1;{number}\n", encoding="utf-8")
+    with pytest.raises(KgcpError, match=rf"line 2: x is '{number}', with a point, where decimals"):
+        read_csv_columns(path, ("time",), ("x",), (), "", CsvLayout(";", ","))
