@@ -26,7 +26,12 @@ from kgcp.io.images.exif import read_frame_header
 from kgcp.io.images.remote import StoredFolder, at_hand
 from kgcp.quality.checks.calibration import check_camera
 from kgcp.quality.checks.camera_position import check_camera_position
-from kgcp.quality.checks.clock import check_completeness, check_exif_times, check_overlap
+from kgcp.quality.checks.clock import (
+    check_completeness,
+    check_exif_times,
+    check_fractions,
+    check_overlap,
+)
 from kgcp.quality.checks.course import Course, check_attitude, course_of
 from kgcp.quality.checks.deviations import check_deviations
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild, ranked
@@ -287,6 +292,7 @@ class FlightInputs:
             offset_s = self.flight.vehicle.settings.time_offset_s
             frame_s = np.array([times[frame] for frame in sorted(times)])
             yield from check_overlap(frame_s, self.trajectory.time_s, offset_s)
+            yield from check_fractions(frame_s)
         is_known = self.detected_s is not None or self._file_times is not None
         if self.flight.vehicle is not None and is_known:
             may_be_by_header = self.detected_s is None and self.flight.may_use_exif_times

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 
 import pandas as pd
@@ -114,3 +115,10 @@ def test_without_a_times_file_all_times_are_of_exif(unmeasured: SampleFlight) ->
 def test_the_key_is_true_or_false(unmeasured: SampleFlight) -> None:
     unmeasured.edit(('times = "frames.csv"', 'times = "frames.csv"\nexif_fallback = "yes"'))
     assert "[frames] exif_fallback: is a text; give true or false" in unmeasured.fails("detect")
+
+
+def test_times_that_a_spreadsheet_has_cut_are_told(unmeasured: SampleFlight) -> None:
+    path = unmeasured.path / "frames.csv"
+    assert "whole seconds" not in unmeasured.run("check").stdout
+    path.write_text(re.sub(r"\.\d+Z", "Z", path.read_text(encoding="utf-8")), encoding="utf-8")
+    assert "all 5 frame times are whole seconds" in unmeasured.run("check").stdout

@@ -22,6 +22,7 @@ _STEADY_S = 2.0
 _SAME_SHARE = 0.02  # of the interval between frames
 _MOST_OUTSIDE = 0.1  # of the frames: some are taken before a logger starts
 _MOSTLY = 0.5
+_FEWEST_WHOLE = 5  # times; fewer may be whole seconds by chance
 
 
 def clock_shifts_s() -> Iterator[tuple[float, str]]:
@@ -115,6 +116,21 @@ def check_completeness(frames: Sequence[str], times_s: Mapping[str, float]) -> I
     remedy = "give [frames] times with one line per frame, named as below the frames folder"
     doubt = grave if len(untimed) == len(frames) else mild
     yield doubt(Cause.NO_TIMES, sentence, remedy, figures)
+
+
+def check_fractions(frame_s: FloatArray) -> Iterator[Doubt]:
+    """Tell frame times (n,) that are all whole seconds: of clocks that have no others, or cut.
+
+    Spreadsheets cut numbers of ten digits where the column is narrow, and save them so.
+    """
+    if len(frame_s) < _FEWEST_WHOLE or np.any(frame_s != np.rint(frame_s)):
+        return
+    yield mild(
+        Cause.WHOLE_SECONDS,
+        f"all {len(frame_s)} frame times are whole seconds, in which a vehicle moves metres",
+        "give times to the millisecond; if a spreadsheet has cut them, export the file again",
+        {"frames": float(len(frame_s))},
+    )
 
 
 def check_exif_times(times_s: Sequence[float], exif_s: Sequence[float]) -> Iterator[Doubt]:

@@ -76,6 +76,7 @@ class Cause(StrEnum):
     CLOCK = "clock", "times are of another clock: leap seconds, hours, days or GPS weeks"
     NO_OVERLAP = "no_overlap", "frames and trajectory are not of the same time"
     NO_TIMES = "no_times", "frames have no time"
+    WHOLE_SECONDS = "whole_seconds", "frame times are whole seconds: too coarse, or cut"
     FRAME_ORDER = "frame_order", "times or reference poses belong to the next or previous frame"
     REFERENCE = "reference", "reference poses are of another place, or turned"
     STATIC_TARGETS = (

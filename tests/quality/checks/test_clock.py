@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.quality.checks.clock import check_exif_times, check_overlap
+from kgcp.quality.checks.clock import check_exif_times, check_fractions, check_overlap
 from kgcp.quality.checks.doubt import Cause
 
 START_S = 1_781_597_700.0
@@ -17,6 +17,15 @@ def test_frames_within_the_trajectory_raise_no_doubt() -> None:
     assert not [*check_overlap(FRAMES_S + 6.0, TRAJECTORY_S, 0.0)]  # the last 2 of 24 are outside
     assert not [*check_overlap(FRAMES_S - 18.0, TRAJECTORY_S, 18.0)]
     assert not [*check_overlap(np.array([]), TRAJECTORY_S, 0.0)]
+
+
+def test_whole_seconds_are_told() -> None:
+    """As a spreadsheet leaves Unix seconds."""
+    assert not [*check_fractions(FRAMES_S)]
+    assert not [*check_fractions(np.floor(FRAMES_S[:4]))]
+    (doubt,) = check_fractions(np.floor(FRAMES_S))
+    assert (doubt.code, doubt.is_grave) == (Cause.WHOLE_SECONDS, False)
+    assert "all 24 frame times are whole seconds" in doubt.sentence
 
 
 @pytest.mark.parametrize(
