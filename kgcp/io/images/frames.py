@@ -21,7 +21,7 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.io.files.safe_read import is_file, is_folder
 from kgcp.io.images.exif import read_exif
-from kgcp.io.images.header import image_size, is_cut_png, upright
+from kgcp.io.images.header import JPEG_END, JPEG_START, image_size, is_cut_jpeg, is_cut_png, upright
 
 __all__ = ["list_frames", "read_exif", "read_grey"]
 
@@ -52,10 +52,11 @@ _MOST_METADATA_BYTES = 1 << 26
 
 CORRECT_FOLDER = "correct [frames] folder in flight.toml"
 
-_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-
 # libjpeg's words for data that it had to guess; it decodes on and only mentions it on stderr.
 _GUESSED_PIXELS = ("Corrupt JPEG data", "Premature end of JPEG file")
+# OpenCV for Windows is linked with a C library of its own, whose stderr may not follow Python's.
+# Files that were cut are told by their missing end there.
+_HEARS_DECODERS = os.name != "nt"
 _STDERR = Lock()  # which a process has but once
 
 
@@ -234,9 +235,11 @@ def _require_size(width: int, height: int, camera: Camera) -> None:
 
 def _decode(encoded: bytes) -> GreyArray:
     size = len(encoded)
-    if encoded.startswith(_JPEG_START):
+    if encoded.startswith(JPEG_START):
+        if not _HEARS_DECODERS and is_cut_jpeg(encoded):
+            raise Rejection(Reason.DECODE_FAILED, _GUESSED_PIXELS[1])
         # A truncated file gets an end: then every version of the decoder notices what is missing.
-        encoded += _JPEG_END
+        encoded += JPEG_END
     grey = None
     with _collected_stderr() as messages, suppress(cv2.error):
         grey = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), _RAW_GREY)

@@ -8,6 +8,7 @@ and files whose tags claim more bytes than there are.
 
 from __future__ import annotations
 
+import re
 import struct
 import warnings
 from collections.abc import Iterator
@@ -19,6 +20,9 @@ from PIL import Image
 FORMATS = ("BMP", "JPEG", "JPEG2000", "PNG", "PPM", "WEBP")
 """Pillow's names of what a frame may be, beside TIFF, whatever its name ends in."""
 
+JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+# Within pixels, 0xff is followed by 0 or by the number of a restart.
+_JPEG_MARKER = re.compile(rb"\xff[^\x00\x01\xd0-\xd7\xff]")
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _WIDTH, _HEIGHT, _ORIENTATION, _EXIF = 256, 257, 274, 34665
 _UPRIGHT = 1
@@ -138,6 +142,17 @@ def is_cut_png(data: bytes) -> bool:
         length, kind = struct.unpack_from(">I4s", data, place)
         place += length + 12
     return kind != b"IEND" or place > len(data)
+
+
+def is_cut_jpeg(data: bytes) -> bool:
+    """Return whether a JPEG ends before its end is marked."""
+    place = len(JPEG_START)
+    while marker := _JPEG_MARKER.search(data, place):
+        if marker[0] == JPEG_END:
+            return False
+        # past the segment: a thumbnail in it has an end of its own
+        place = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2])
+    return True
 
 
 def _tiff_size(stream: BinaryIO, layout: _Layout) -> tuple[int, int] | None:

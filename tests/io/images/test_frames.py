@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from PIL import Image
 from kgcp.errors import KgcpError, Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
+from kgcp.io.images import frames
 from kgcp.io.images.frames import list_frames, read_grey
 
 WIDTH, HEIGHT = 320, 200
@@ -146,6 +148,23 @@ class TestReadGrey:
         )
         assert rejection(path).reason is Reason.DECODE_FAILED
         assert capfd.readouterr() == ("", "")
+
+    @pytest.mark.parametrize("progressive", [0, 1])
+    def test_a_cut_jpeg_is_rejected_where_decoders_are_not_heard(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, progressive: int
+    ) -> None:
+        monkeypatch.setattr(frames, "_collected_stderr", lambda: nullcontext([]))
+        monkeypatch.setattr(frames, "_HEARS_DECODERS", False)
+        thumbnail = encoded(textured()[:20, :30], ".jpg")
+        exif = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2) + thumbnail
+        data = encoded(textured(), ".jpg", cv2.IMWRITE_JPEG_PROGRESSIVE, progressive)
+        data = data[:2] + exif + data[2:]
+        path = tmp_path / "frame.jpg"
+        path.write_bytes(data + b"whatever a camera appends")
+        assert read_grey(path, CAMERA).shape == (HEIGHT, WIDTH)
+        for size in (len(data) // 2, len(data) - 2):
+            path.write_bytes(data[:size])
+            assert str(rejection(path)) == "decode_failed: Premature end of JPEG file"
 
     @pytest.mark.parametrize("suffix", [".png", ".tif", ".bmp", ".webp", ".jp2"])
     def test_other_damaged_images_are_rejected_in_silence(
