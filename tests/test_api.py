@@ -46,6 +46,12 @@ def test_the_package_alone_imports_no_library() -> None:
     assert not {"numpy", "cv2", "scipy", "pandas", "numba", "click"} & set(done.stdout.split())
 
 
+def test_examples_that_start_processes_can_be_imported_by_them() -> None:
+    starting = [example for example in EXAMPLES if "detect_flight(" in example]
+    assert starting
+    assert all('if __name__ == "__main__":' in example for example in starting)
+
+
 def test_the_examples_of_the_page_run_one_after_the_other(tmp_path: Path) -> None:
     (tmp_path / "sample_flight").symlink_to(ROOT / "sample_flight")
     # each example has its own names, as if it were run alone; one process saves the imports
