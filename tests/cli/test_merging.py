@@ -47,7 +47,7 @@ def two(measured: SampleFlight, tmp_path: Path) -> tuple[SampleFlight, SampleFli
     "text",
     [
         f"{FRAMES[0]}\n# a comment\n\n{FRAMES[1]},A\n",
-        f"frame;target\n{FRAMES[0]};A\n{FRAMES[1]};\n",
+        f"\ufeffframe;target;\r\n{FRAMES[0]};A;;\r\n{FRAMES[1]};\r\n;;\r\n",
         f"target,frame,flight\nA,{FRAMES[0]},sample\n,{FRAMES[1]},\n",
     ],
 )

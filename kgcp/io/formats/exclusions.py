@@ -40,7 +40,7 @@ def read_exclusions(path: Path) -> tuple[Exclusion, ...]:
     """
     if not is_file(path):
         raise KgcpError(f"{path}: does not exist; name a file of frames to leave out")
-    rows = [(number, cells) for number, cells in _rows(path) if any(cells)]
+    rows = [(number, cells) for number, cells in _rows(path) if cells]
     columns: Sequence[str] = _UNNAMED
     if rows and "frame" in rows[0][1] and set(rows[0][1]) <= set(_COLUMNS):
         columns, rows = rows[0][1], rows[1:]
@@ -53,10 +53,12 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
         if text and not text.startswith("#"):
             separator = ";" if ";" in text and "," not in text else ","
             try:
-                cells = next(csv.reader([text], delimiter=separator))
+                cells = [cell.strip() for cell in next(csv.reader([text], delimiter=separator))]
             except csv.Error as error:
                 raise KgcpError(f"{path}, line {number}: {error}; repair the line") from error
-            yield number, [cell.strip() for cell in cells]
+            while cells and not cells[-1]:
+                cells.pop()  # as a spreadsheet adds them
+            yield number, cells
 
 
 def _exclusion(path: Path, line: int, columns: Sequence[str], cells: Sequence[str]) -> Exclusion:
