@@ -54,6 +54,12 @@ def is_number(text: str) -> bool:
         return False
 
 
+def remedy_for_missing(path: Path, remedy: str) -> str:
+    """Return what to do about a missing file: Notepad may have added `.txt` to its name."""
+    added = Path(f"{path}.txt")
+    return f"rename {added.name}, whose .txt Windows may hide" if is_file(added) else remedy
+
+
 def require_file(path: Path, toml_key: str) -> None:
     """Refuse what is not a regular file.
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from kgcp.errors import KgcpError, SettingError
-from kgcp.io.files.safe_read import LARGEST, is_file
+from kgcp.io.files.safe_read import LARGEST, is_file, remedy_for_missing
 
 Value = TypeVar("Value")
 Word = TypeVar("Word", bound=str)
@@ -175,7 +175,8 @@ class TomlTable:
         if not is_file(path):
             if os.path.lexists(path):
                 raise self.error(key, f"{self.text(key)!r} is not a regular file", "name a file")
-            raise self.error(key, f"{self.text(key)!r} does not exist", "create or correct it")
+            remedy = remedy_for_missing(path, "create or correct it")
+            raise self.error(key, f"{self.text(key)!r} does not exist", remedy)
         return path
 
     def vector(

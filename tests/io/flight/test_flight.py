@@ -261,6 +261,17 @@ def test_a_folder_without_flight_toml_says_what_it_lacks(tmp_path: Path) -> None
         read_flight(tmp_path)
 
 
+def test_an_ending_that_notepad_has_added_is_told(tmp_path: Path) -> None:
+    (tmp_path / "flight.toml.txt").touch()
+    with pytest.raises(KgcpError, match=r"flight\.toml: does not exist; rename flight\.toml\.txt,"):
+        read_flight(tmp_path)
+    (tmp_path / "flight.toml").write_text('[frames]\ntimes = "times.csv"\n', encoding="utf-8")
+    (tmp_path / "frames").mkdir()
+    (tmp_path / "times.csv.txt").touch()
+    with pytest.raises(KgcpError, match=r"'times\.csv' does not exist; rename times\.csv\.txt,"):
+        read_flight(tmp_path)
+
+
 def test_a_file_is_no_flight_folder(write: Write) -> None:
     path = write(FLIGHT) / "flight.toml"
     with pytest.raises(KgcpError, match=r"flight.toml: is a file; name the flight folder"):
