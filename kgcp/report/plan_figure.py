@@ -13,6 +13,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from kgcp.errors import SettingError
 from kgcp.io.files.atomic import write_bytes
+from kgcp.io.print.typeface import printable
 from kgcp.report.style import BLUE, GREY, VERMILION, sheet
 from kgcp.simulation.outlook import Outlook
 
@@ -49,7 +50,7 @@ def write_plan_figure(outlooks: Sequence[Outlook], title: str, path: Path) -> No
     stream = io.BytesIO()
     with sheet(9.6) as figure:
         panels = figure.subplots(4, 1, sharex=True)
-        lines = textwrap.fill(title, _TITLE_LETTERS)
+        lines = textwrap.fill(printable(title), _TITLE_LETTERS)
         figure.suptitle(lines, fontsize=12, parse_math=False)  # names may have dollars
         for draw, axes in zip(
             (_draw_distance, _draw_centre, _draw_found, _draw_ground), panels, strict=True

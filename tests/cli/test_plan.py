@@ -115,7 +115,7 @@ def test_the_figure_is_drawn(flight: Path) -> None:
 
 def test_a_long_name_with_dollars_is_drawn_whole_in_several_lines(flight: Path) -> None:
     toml = (flight / "flight.toml").read_text(encoding="utf-8")
-    name = "$\\frac{$ " + "roof " * 20
+    name = "$\\frac{$ 车顶 " + "roof " * 20  # of which the typeface lacks two letters
     assert toml.count('name = "A"') == 1
     text = toml.replace('name = "A"', f"name = '{name}'")
     (flight / "flight.toml").write_text(text, encoding="utf-8")
@@ -123,7 +123,7 @@ def test_a_long_name_with_dollars_is_drawn_whole_in_several_lines(flight: Path) 
     result = run(flight, "--plot", path)
     assert result.exit_code == 0, result.output
     lines = re.findall(r"<!-- (.*(?:Target|roof).*) -->", path.read_text(encoding="utf-8"))
-    assert " ".join(lines) == f"Target {name.strip()}"
+    assert " ".join(lines) == f"Target {name.strip()}".replace("车顶", "??")
     assert max(map(len, lines)) < 50
 
 

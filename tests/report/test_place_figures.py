@@ -20,6 +20,7 @@ from kgcp.report.style import picture, sheet
         (10, "GCP-001"),
         (24, "a rather long name"),
         (300, "GCP-001"),
+        (3, "地面点"),  # which the typeface lacks: a warning would be an error here
     ],
 )
 def test_names_neither_overlap_nor_leave_the_figure(count: int, name: str) -> None:

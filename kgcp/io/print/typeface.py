@@ -1,4 +1,4 @@
-"""The typeface of printed sheets: DejaVu Sans, which comes with matplotlib."""
+"""The typeface of sheets and figures: DejaVu Sans, which comes with matplotlib."""
 
 from __future__ import annotations
 
@@ -22,14 +22,16 @@ def font(*, is_bold: bool) -> FontProperties:
     return FontProperties(fname=str(_font_file(is_bold=is_bold)))
 
 
+def printable(text: str, *, is_bold: bool = False) -> str:
+    """Return a text with question marks for characters that the typeface lacks, as Chinese."""
+    characters = _characters(is_bold=is_bold)
+    return "".join(letter if ord(letter) in characters else _UNKNOWN for letter in text)
+
+
 @cache
 def fit_text(text: Text) -> tuple[str, float]:
-    """Return the printable part of a text, and the type's size [mm] at which it fits.
-
-    Characters that the typeface lacks become question marks.
-    """
-    characters = _characters(is_bold=text.is_bold)
-    words = "".join(letter if ord(letter) in characters else _UNKNOWN for letter in text.words)
+    """Return what is printable of a text, and the type's size [mm] at which it fits."""
+    words = printable(text.words, is_bold=text.is_bold)
     typeface = font(is_bold=text.is_bold)
     typeface.set_size(text.size_mm)
     width_mm, _, _ = text_to_path.get_text_width_height_descent(words, typeface, ismath=False)

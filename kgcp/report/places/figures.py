@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.io.print.typeface import printable
 from kgcp.network.ground.target_places import PlacedTarget
 from kgcp.report.style import BLUE, GREEN, GREY, VERMILION, Picture, picture, sheet
 
@@ -46,7 +47,7 @@ def _diameters(placed: tuple[PlacedTarget, ...]) -> Picture:
 
 
 def _shortened(name: str) -> str:
-    return name if len(name) <= _NAME_LETTERS else f"{name[: _NAME_LETTERS - 1]}…"
+    return printable(name if len(name) <= _NAME_LETTERS else f"{name[: _NAME_LETTERS - 1]}…")
 
 
 def name_ticks(axes: Axes, places: FloatArray | IndexArray, names: list[str]) -> None:
