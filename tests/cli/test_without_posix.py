@@ -38,6 +38,12 @@ for module, name in ((os, "memfd_create"), (os, "O_NOFOLLOW"), (os, "O_CLOEXEC")
                      (signal, "pthread_sigmask"), (signal, "SIGALRM"), (signal, "SIG_BLOCK")):
     if hasattr(module, name):
         delattr(module, name)
+
+import multiprocessing.forkserver  # which finds what is left of the others
+
+context = multiprocessing.get_context
+multiprocessing.get_context = lambda name=None: context("spawn" if name == "forkserver" else name)
+multiprocessing.forkserver.ensure_running = lambda: None
 """
 
 
