@@ -181,7 +181,9 @@ def parsed_url(text: str) -> Path | StoredFolder:
         return Path(text)
     parts = urlsplit(text)
     if parts.scheme == "file":
-        return Path(url2pathname(parts.path))
+        # a share of another computer, as Windows names it
+        host = "" if parts.netloc in {"", "localhost"} else f"//{parts.netloc}"
+        return Path(url2pathname(host + parts.path))
     if len(parts.scheme) == 1:  # the letter of a drive
         return Path(text)
     if parts.scheme not in _KNOWN or not parts.netloc:

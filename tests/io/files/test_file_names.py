@@ -57,4 +57,6 @@ def test_letters_of_drives_are_no_stores(text: str) -> None:
 
 def test_urls_of_files_are_paths() -> None:
     assert parsed_url("file:///data/my%20flight") == Path("/data/my flight")
+    assert parsed_url("file://localhost/data") == Path("/data")
+    assert parsed_url("file://server/share/my%20flight") == Path("//server/share/my flight")
     assert isinstance(parsed_url("s3://bucket/flight"), StoredFolder)
