@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from kgcp.geometry.arrays import GreyArray
+from kgcp.io.files.portable import replace
 
 _MOST_BYTES = 1 << 31  # a thousand frames of 2 Mpx
 _SHARE_OF_DISK = 0.25  # of what is free
@@ -42,7 +43,7 @@ class KeptFrames:
             if number * grey.nbytes <= self.most_bytes:
                 with unfinished.open("wb") as stream:
                     np.lib.format.write_array(stream, grey, allow_pickle=False)
-                unfinished.replace(path)
+                replace(unfinished, path)
         except OSError:
             remove_kept_frames(self.folder)
 

@@ -71,3 +71,19 @@ def test_a_full_disk_gets_back_what_was_kept(
         kept.keep("b", np.zeros((3, 4), np.uint8))
         assert kept.find("a") is None
         assert not (tmp_path / "frames").exists()
+
+
+def test_a_scanner_that_opens_new_files_does_not_end_all_keeping(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rename, refusals = Path.replace, iter([True])
+
+    def refused_once(path: Path, target: Path) -> Path:
+        if next(refusals, False):
+            raise PermissionError(errno.EACCES, "Access is denied")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "replace", refused_once)
+    kept = KeptFrames(tmp_path, 1000)
+    kept.keep("a", np.zeros((3, 4), np.uint8))
+    assert kept.find("a") is not None
