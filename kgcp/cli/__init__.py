@@ -107,8 +107,16 @@ class Program(click.Group):
         _print_anything()
         gc.set_threshold(_OBJECTS)
         atexit.register(gc.freeze)  # 0.2 s of searching what ends with the process anyway
-        # Else click replaces every pattern on Windows, also that of --frames, however it is quoted.
-        return super().main(*args, windows_expand_args=False, **kwargs)
+        try:
+            # Else click replaces every pattern on Windows, also that of --frames, however quoted.
+            return super().main(*args, windows_expand_args=False, **kwargs)
+        except OSError as error:  # here and not in `invoke`, which help does not reach
+            if error.errno != errno.ENOSPC:
+                raise
+            where = "" if error.filename is None else f"{error.filename}: "
+            text = f"kgcp: error: {where}no space left; make room, then repeat the command"
+            click.echo(text, err=True)
+            sys.exit(_EXIT_KNOWN_ERROR)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the arguments as they were meant in the shell."""
@@ -157,13 +165,6 @@ class Program(click.Group):
                 return super().invoke(ctx)
         except KgcpError as error:
             click.echo(f"kgcp: error: {self._in_options(ctx, error)}", err=True)
-            ctx.exit(_EXIT_KNOWN_ERROR)
-        except OSError as error:
-            if error.errno != errno.ENOSPC:
-                raise
-            where = "" if error.filename is None else f"{error.filename}: "
-            text = f"kgcp: error: {where}no space left; make room, then repeat the command"
-            click.echo(text, err=True)
             ctx.exit(_EXIT_KNOWN_ERROR)
         except KeyboardInterrupt:
             click.echo("kgcp: interrupted; files written so far are complete", err=True)

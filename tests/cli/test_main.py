@@ -146,6 +146,21 @@ def test_a_full_disk_is_reported_in_one_line(path: str | None) -> None:
     assert code == 1
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no such device")
+@pytest.mark.parametrize("arguments", [("--help",), ("--version",), ("detect", "--help")])
+def test_help_onto_a_full_disk_ends_in_one_line(arguments: tuple[str, ...]) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "kgcp", *arguments],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert done.stderr == "kgcp: error: no space left; make room, then repeat the command\n"
+    assert done.returncode == 1
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Popen closes no streams there")
 @pytest.mark.parametrize("closed", [(2,), (0, 1, 2)])
 def test_detection_runs_where_standard_streams_are_closed(
