@@ -61,7 +61,7 @@ REASONS: Mapping[str, str] = {
     "no_lattice": "the discs do not lie like the field's",
     "two_fields": "two fields in one photograph",
     "ambiguous": "a part of the field that could be another part; show all of it, or a mark",
-    OTHER_SIZE: "the photograph has another size than most",
+    OTHER_SIZE: "the photograph has another size than those that are used",
     DUPLICATE: "the same as another photograph, which says nothing new",
     UNLIKE_FIELD: "it does not fit the camera and the field of the other photographs: other zoom,"
     " focus or crop, a field bent otherwise, or discs with wrong names",
@@ -298,7 +298,7 @@ def _stamp(item: Photo | SecondLook) -> tuple[int, int] | None:
 
 
 def _of_one_camera(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[PhotoDiscs | PhotoMiss]:
-    """Return the results with photographs of another size than most left out.
+    """Return the results with photographs of another size than the commonest left out.
 
     Raises
     ------
@@ -325,7 +325,8 @@ def _of_one_camera(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[PhotoDiscs
             result.width,
             result.height,
             OTHER_SIZE,
-            f"{result.width} x {result.height} px, most have {usual[0]} x {usual[1]}"
+            f"{result.width} x {result.height} px, {sizes[usual]} of {len(found)} have"
+            f" {usual[0]} x {usual[1]}"
             + (", which is transposed" if (result.height, result.width) == usual else ""),
         )
         for result in results
