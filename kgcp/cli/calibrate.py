@@ -150,7 +150,7 @@ def command(
     from kgcp.measurement.discs.records import Operator
     from kgcp.network.calibration_records import CalibrationSettings, LensModel, PointModel
     from kgcp.pipeline.calibration.against import read_other
-    from kgcp.pipeline.calibration.run import CalibrationOptions, calibrate_photos, find_photos
+    from kgcp.pipeline.calibration.run import CalibrationOptions, calibrated_photos, find_photos
     from kgcp.report.plotting import load_matplotlib
 
     load_matplotlib()  # before the report does
@@ -165,9 +165,12 @@ def command(
     )
     found = find_photos(photos)
     other = None if against is None else read_other(against, found)
-    with log_to_stderr(is_quiet=is_quiet, as_json=log_json, unit="photo") as log, stopping(log):
-        made = calibrate_photos(found, field, out, options, log)
-    results = write_results(made, out, formats, other)
+    with (
+        log_to_stderr(is_quiet=is_quiet, as_json=log_json, unit="photo") as log,
+        stopping(log),
+        calibrated_photos(found, field, out, options, log) as made,
+    ):
+        results = write_results(made, out, formats, other)
     if as_json:
         import json
 

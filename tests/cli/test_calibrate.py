@@ -6,6 +6,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -51,6 +52,7 @@ dot_diameter_m = 0.13
 code_deg = [0, 43, 78, 180]
 """
 TILTS = ((0.5, 0.0), (0.0, 0.5), (-0.5, 0.1), (0.1, -0.5), (0.35, 0.35))
+RUN = "kgcp.pipeline.calibration.run"
 QUIET = ("--jobs", "0", "--response", "linear", "--quiet")
 
 
@@ -372,6 +374,24 @@ def test_two_fields_in_each_photograph_are_to_be_covered(photos: Path, tmp_path:
     assert result.exit_code == 1
     assert "; left out: 3 two_fields (1.png" in result.stderr
     assert "; cover all but one field" in result.stderr
+
+
+def test_results_that_cannot_be_written_cost_no_measurements(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    obstacle = tmp_path / "calibration.html"
+    obstacle.mkdir()
+    arguments = (photos, "--field", photos / "field.toml", "--out", tmp_path, *QUIET)
+    failed = run(*arguments)
+    assert f"{obstacle}: cannot be written" in failed.stderr
+    assert failed.exit_code == 1
+    obstacle.rmdir()
+    for name in ("measure_photo", "measure_photo_again"):
+        monkeypatch.setattr(
+            f"kgcp.pipeline.calibration.run.{name}", Mock(side_effect=AssertionError)
+        )
+    assert run(*arguments).exit_code == 0
+    assert not list(tmp_path.glob(".*"))
 
 
 def test_photographs_of_another_size_are_left_out(photos: Path, tmp_path: Path) -> None:

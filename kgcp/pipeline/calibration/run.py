@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 import warnings
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -162,7 +162,6 @@ def _in_reading_order(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
 
 
-@single_threaded()
 def calibrate_photos(
     photos: Sequence[Photo],
     field: AnyField,
@@ -170,17 +169,35 @@ def calibrate_photos(
     options: CalibrationOptions,
     listener: ProgressListener,
 ) -> PhotoCalibration:
-    """Calibrate the camera that took photographs of a field.
+    """Calibrate the camera that took photographs of a field, where nothing is written of it.
 
-    However the work is interrupted, what was measured is kept in a journal in `out`, and the same
-    call goes on from there. The journal is deleted once the camera is calibrated.
+    Raises
+    ------
+    KgcpError
+        As `calibrated_photos`.
+    """
+    with calibrated_photos(photos, field, out, options, listener) as made:
+        return made
+
+
+@contextmanager
+def calibrated_photos(
+    photos: Sequence[Photo],
+    field: AnyField,
+    out: Path,
+    options: CalibrationOptions,
+    listener: ProgressListener,
+) -> Iterator[PhotoCalibration]:
+    """Calibrate the camera that took photographs of a field, for a block that writes the results.
+
+    However the work or the block is interrupted, what was measured is kept in a journal in `out`,
+    and the same call goes on from there. The journal is deleted once the block has ended.
 
     Raises
     ------
     KgcpError
         If the photographs are by several cameras, or fewer than three can be used.
     """
-    task = PhotoTask(field, options.response, options.operator)
     making = {
         "the version of kgcp or of a library": to_text(versions()),
         "the field": fingerprint(field),
@@ -188,10 +205,22 @@ def calibrate_photos(
     }
     kinds: tuple[type[PhotoDiscs | PhotoMiss], ...] = (PhotoDiscs, PhotoMiss)
     path, is_new = out / ".calibration.journal", options.is_restart
-    with (
-        Journal(path, making, kinds, is_new=is_new) as journal,
-        open_pool(options.jobs, options.photo_timeout_s, None, out) as pool,
-    ):
+    with Journal(path, making, kinds, is_new=is_new) as journal:
+        yield _calibrated(journal, photos, field, out, options, listener)
+        journal.remove()
+
+
+@single_threaded()
+def _calibrated(
+    journal: Journal[PhotoDiscs | PhotoMiss],
+    photos: Sequence[Photo],
+    field: AnyField,
+    out: Path,
+    options: CalibrationOptions,
+    listener: ProgressListener,
+) -> PhotoCalibration:
+    task = PhotoTask(field, options.response, options.operator)
+    with open_pool(options.jobs, options.photo_timeout_s, None, out) as pool:
         task = replace(task, camera=_camera_of(pool, task, photos))
         looks = _Looks(journal, pool, listener, task.camera)
         first = looks.through(
@@ -207,7 +236,6 @@ def calibrate_photos(
         )
         results = _second_pass(looks, task, photos, results, start)
         final = calibrate_camera(_views(results), field, _size(results), options.settings, start)
-        journal.remove()
     camera = replace(final.camera, response=options.response)
     calibration = replace(final, camera=camera)
     return _outcome(photos, field, options, results, calibration)
