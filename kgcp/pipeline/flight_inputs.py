@@ -33,7 +33,7 @@ from kgcp.quality.checks.clock import (
     check_overlap,
 )
 from kgcp.quality.checks.course import Course, check_attitude, course_of
-from kgcp.quality.checks.deviations import check_deviations
+from kgcp.quality.checks.deviations import check_deviations, check_pose_deviations
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild, ranked
 from kgcp.quality.checks.frame_header import FrameHeader, check_frames
 from kgcp.quality.checks.lever_arm import check_lever_arm
@@ -235,6 +235,8 @@ class FlightInputs:
             if self.reference_poses is not None:
                 doubts += check_reference(self.reference_poses, self.target_positions)
         poses = self.reference_poses
+        if poses is not None:
+            doubts += check_pose_deviations(poses)
         is_doubted = any(doubt.is_grave or doubt.code in _OF_TIMES for doubt in doubts)
         if poses is not None and not is_doubted:
             doubts += check_visibility(poses.frames, self.frames, self.expected_radii_px)

@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from kgcp.geometry.attitude import ReferencePoses
 from kgcp.georef.trajectory import Motion
-from kgcp.quality.checks.deviations import check_deviations
+from kgcp.quality.checks.deviations import check_deviations, check_pose_deviations
 from kgcp.quality.checks.doubt import Cause
 
 _SD = np.full((5, 3), 0.02)
 _MOTION = Motion(np.arange(5.0), np.zeros((5, 3)), np.tile(np.eye(3), (5, 1, 1)), _SD, _SD)
+_POSES = ReferencePoses(tuple("abcde"), np.zeros((5, 3)), np.zeros((5, 3)), _SD, _SD[:, 0])
 
 
 def test_deviations_that_are_known_or_missing_raise_no_doubt() -> None:
@@ -36,3 +38,15 @@ def test_epochs_with_deviations_of_zero_are_counted() -> None:
     (doubt,) = check_deviations(replace(_MOTION, sd_position_m=sd))
     assert "are 0 at 2 of 5 epochs" in doubt.sentence
     assert doubt.figures == {"epochs": 2.0}
+
+
+def test_reference_poses_with_deviations_of_zero_are_doubted() -> None:
+    assert not [*check_pose_deviations(_POSES)]
+    assert not [*check_pose_deviations(replace(_POSES, sd_position_m=None, sd_angle_deg=None))]
+    angles = np.array([0.0, 0.01, 0.01, 0.0, 0.01])
+    position, angle = check_pose_deviations(
+        replace(_POSES, sd_position_m=_SD * [1.0, 1.0, 0.0], sd_angle_deg=angles)
+    )
+    assert {position.code, angle.code} == {Cause.STANDARD_DEVIATIONS}
+    assert "reference poses' positions are 0 in all poses" in position.sentence
+    assert "reference poses' angles are 0 in 2 of 5 poses" in angle.sentence
