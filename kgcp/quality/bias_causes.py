@@ -54,14 +54,15 @@ class Regression:
     # (n,): rows that have all quantities; those of them that fit nothing and were left out
     used: BoolArray
     outlier: BoolArray
-    scatter: float  # of the residuals over their stated standard deviations; 1 where these are true
+    # of the residuals about a plain fit, over their stated deviations; 1 where these are true
+    scatter: float
     correlation_s: float  # as in `RegressionFit`
     # of the variance that scale and offset leave, what the terms of exposure explain, corrected for
     # their number; 0 without any
     exposure_share: float
     # of as large a share by chance (F test); None without such terms
     exposure_probability: float | None
-    systematic_m: FloatArray  # (n,): what all terms but those of exposure make [m]
+    systematic_m: FloatArray  # (n,): what a plain fit finds, without the terms of exposure [m]
 
     @property
     def exposure_terms(self) -> tuple[Term, ...]:
@@ -167,14 +168,19 @@ def _regression(
     used: BoolArray,
     result: RegressionFit,
 ) -> Regression:
-    """Return a fit by its terms, with what of it they and exposure explain."""
+    """Return a fit by its terms, with what of it they and exposure explain.
+
+    Errors that last longer than the flight are an offset themselves, and the fit leaves open which
+    is which: its values may lie beside all residuals, within standard deviations that say so. What
+    residuals have in common, and how they scatter about it, is therefore that of a plain fit.
+    """
     outlier = np.zeros(len(used), dtype=bool)
     outlier[used] = result.outlier
     basic = _without_exposure(names)
     design = np.column_stack([columns[name] for name in names])
     share, probability = _share_of_exposure(names, result)
-    left = data.residual_m - design @ result.values
-    unit = left / np.sqrt(data.errors.total)
+    values = _plain_fit(data, design, used & ~outlier)
+    unit = (data.residual_m - design @ values) / np.sqrt(data.errors.total)
     return Regression(
         terms=_terms(names, result),
         tangled=tangled,
@@ -185,8 +191,17 @@ def _regression(
         correlation_s=result.correlation_s,
         exposure_share=share,
         exposure_probability=probability,
-        systematic_m=design[:, basic] @ result.values[basic],
+        systematic_m=design[:, basic] @ values[basic],
     )
+
+
+def _plain_fit(data: DistanceResiduals, design: FloatArray, chosen: BoolArray) -> FloatArray:
+    """Return the values (p,) by weights alone, as if no error lasted."""
+    weight = 1.0 / np.sqrt(data.errors.total[chosen])
+    rows = design[chosen] * weight[:, None]
+    size = np.linalg.norm(rows, axis=0)
+    values = np.linalg.lstsq(rows / size, data.residual_m[chosen] * weight, rcond=None)[0]
+    return np.asarray(values / size)
 
 
 def _without_exposure(names: Sequence[str]) -> list[int]:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -97,6 +98,25 @@ def plain(
     noise = ErrorModel(np.full(n, sd_m**2), np.zeros(n), np.arange(float(n)))
     missing = {quantity.name: np.full(n, np.nan) for quantity in QUANTITIES}
     return DistanceResiduals(distance_m, 1000.0 / distance_m, residual_m, noise, missing | exposure)
+
+
+def test_errors_that_last_do_not_move_what_residuals_have_in_common() -> None:
+    rng = np.random.default_rng(0)
+    n, span_s = 24, 30.0
+    moved, scatter = 0.0, 0.0
+    for _ in range(20):
+        distance, time_s = rng.uniform(10.0, 90.0, n), np.sort(rng.uniform(0.0, span_s, n))
+        wave = np.sin(time_s / span_s * rng.uniform(1.0, 4.0) + rng.uniform(0.0, 6.0))
+        sd = np.full(n, 0.02)
+        errors = ErrorModel(np.full(n, 0.003**2), sd**2, time_s)
+        residual = 0.03 * wave + 0.003 * rng.standard_normal(n)
+        found = regress(replace(plain(distance, residual, 0.01), errors=errors))
+        assert found is not None
+        left = (residual - found.systematic_m) / np.sqrt(errors.total)
+        moved = max(moved, abs(float(left.mean())))
+        scatter = max(scatter, found.scatter)
+    assert moved < 0.1
+    assert scatter < 1.5
 
 
 def test_blur_of_curved_edges_is_told_from_scale_and_offset() -> None:
