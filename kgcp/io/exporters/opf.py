@@ -96,7 +96,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
 
 
 def _gcps(points: MapPoints, camera_ids: Mapping[str, int]) -> list[dict[str, object]]:
-    definition, units = _definition(points), _metres_per_unit(points)
+    definition, units = _definition(points), points.metres_per_unit
     return [
         {
             "id": point_id,
@@ -133,18 +133,9 @@ def _definition(points: MapPoints) -> str:
     return whole.to_wkt(WktVersion.WKT2_2019)
 
 
-def _metres_per_unit(points: MapPoints) -> list[float]:
-    """Return the size of the axes' units, x, y, z [m]; OPF wants metres for a geographic CRS."""
-    crs = points.parsed_crs
-    if crs.is_geographic:
-        return [1.0] * 3
-    whole = crs if crs.is_compound else crs.to_3d()
-    return [axis.unit_conversion_factor for axis in whole.axis_info]
-
-
 def _scene_reference_frame(points: MapPoints) -> dict[str, object]:
     """Return the project's CRS and the way to right-handed metres near 0: scale, swap, shift."""
-    scale = np.array(_metres_per_unit(points))
+    scale = points.metres_per_unit
     own: FloatArray = np.array(points.own_axes(points.gcps[0].position_map.tolist()))
     swaps = _is_left_handed(points)
     metres = (own * scale)[[1, 0, 2] if swaps else [0, 1, 2]]

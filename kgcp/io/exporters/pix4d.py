@@ -1,8 +1,9 @@
 """PIX4Dmatic's CSV of ground control points and of their marks in the images.
 
 By support.pix4d.com 360038397752 and 360035474951: label, two coordinates in the order of the CRS's
-own definition, height, horizontal and vertical accuracy; image, label, x, y, accuracy [px], with
-(0, 0) px in the corner of the top-left pixel. Neither has a header line.
+own definition, height, horizontal and vertical accuracy, both in the units of the coordinates or,
+if these are degrees, in metres; image, label, x, y, accuracy [px], with (0, 0) px in the corner of
+the top-left pixel. Neither has a header line.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ PIX4Dmatic
 1. Import ground control points: gcps.csv, coordinate system {crs},
    z is {heights}: choose it as such, or points and images are
    tens of metres apart. The columns have the axis order of the CRS's own definition:
-   {order} first. The two accuracies are metres.
+   {order} first. The two accuracies have the units of the coordinates
+   beside them, metres if these are degrees.
    checkpoints.csv, if it is here, has the points kept for checking: import it as check points.
 2. Import marks: marks.csv. Image name, label, x, y, accuracy [px]; image directory off or the
    folder that holds the images, zoom level off.
@@ -73,13 +75,14 @@ def files(points: MapPoints) -> Mapping[str, str]:
 
 def _points(points: MapPoints, gcps: Iterable[Gcp]) -> str:
     label = labels(points.gcps, _FOLDER)
+    horizontal, _, vertical = points.metres_per_unit
     lines, groups = [], by_id(gcps)
     covs = [group[0].cov_m2 for group in groups.values()]
     is_each_known = all(cov is not None for cov in covs)  # lines of one file are alike
     for (point_id, group), cov in zip(groups.items(), covs, strict=True):
         cells = [label[point_id], *points.own_axes(points.xyz(group[0].position_map))]
         if cov is not None and is_each_known:
-            accuracies = largest_sd(cov[:2, :2]), float(deviations(cov)[2])
+            accuracies = largest_sd(cov[:2, :2]) / horizontal, float(deviations(cov)[2]) / vertical
             cells += map(decimals, accuracies)
         lines.append(",".join(cells) + "\n")
     return "".join(lines)

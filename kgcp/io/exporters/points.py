@@ -79,6 +79,15 @@ class MapPoints:
         return f"{kind} [{unit}]"
 
     @property
+    def metres_per_unit(self) -> FloatArray:
+        """The size (3,) of the units of x, y, z [m]; 1 for all of a geographic CRS."""
+        crs = self.parsed_crs
+        if crs.is_geographic:
+            return np.ones(3)
+        whole = crs if crs.is_compound else crs.to_3d()
+        return np.array([axis.unit_conversion_factor for axis in whole.axis_info])
+
+    @property
     def controls(self) -> tuple[Gcp, ...]:
         """The points that are not kept for checking."""
         return tuple(point for point in self.gcps if not point.is_checkpoint)

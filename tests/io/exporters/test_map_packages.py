@@ -68,6 +68,22 @@ def test_pix4d_and_opf_follow_the_axes_of_the_crs(
     assert "latitude or northing first" in " ".join(pix4d.files(points)["pix4d/HOWTO.txt"].split())
 
 
+@pytest.mark.parametrize(
+    ("crs", "metres_per_unit_of_z"), [("EPSG:2263", 1.0), ("EPSG:2263+6360", 1200 / 3937)]
+)
+def test_accuracies_of_pix4d_have_the_units_of_the_coordinates(
+    points: MapPoints, crs: str, metres_per_unit_of_z: float
+) -> None:
+    def accuracies(points: MapPoints) -> list[float]:
+        first = pix4d.files(points)["pix4d/gcps.csv"].splitlines()[0]
+        return [*map(float, first.split(",")[4:])]
+
+    horizontal_m, vertical_m = accuracies(points)
+    horizontal, vertical = accuracies(replace(points, crs=crs, priors=()))
+    assert horizontal == pytest.approx(horizontal_m * 3937 / 1200, abs=1e-8)
+    assert vertical == pytest.approx(vertical_m / metres_per_unit_of_z, abs=1e-8)
+
+
 def test_the_lines_of_pix4d_have_as_many_cells_each(points: MapPoints) -> None:
     first, *others = points.gcps
     mixed = replace(points, gcps=(replace(first, cov_m2=None), *others))
