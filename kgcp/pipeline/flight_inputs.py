@@ -31,6 +31,7 @@ from kgcp.quality.checks.clock import (
     check_exif_times,
     check_fractions,
     check_overlap,
+    check_same_times,
 )
 from kgcp.quality.checks.course import Course, check_attitude, course_of
 from kgcp.quality.checks.deviations import check_deviations, check_pose_deviations
@@ -295,6 +296,7 @@ class FlightInputs:
             frame_s = np.array([times[frame] for frame in sorted(times)])
             yield from check_overlap(frame_s, self.trajectory.time_s, offset_s)
             yield from check_fractions(frame_s)
+            yield from check_same_times(times)
         is_known = self.detected_s is not None or self._file_times is not None
         if self.flight.vehicle is not None and is_known:
             may_be_by_header = self.detected_s is None and self.flight.may_use_exif_times

@@ -133,6 +133,28 @@ def check_fractions(frame_s: FloatArray) -> Iterator[Doubt]:
     )
 
 
+def check_same_times(times_s: Mapping[str, float]) -> Iterator[Doubt]:
+    """Tell frames that have the time of another: one camera takes one photograph at a time."""
+    first_of: dict[float, str] = {}
+    pairs = [
+        (frame, first_of[times_s[frame]])
+        for frame in sorted(times_s)
+        if first_of.setdefault(times_s[frame], frame) != frame
+    ]
+    if not pairs:
+        return
+    frame, first = pairs[0]
+    have = "has" if len(pairs) == 1 else "have"
+    yield mild(
+        Cause.SAME_TIMES,
+        f"{len(pairs)} of {len(times_s)} frames {have} the time of another frame, such as {frame}"
+        f" that of {first}",
+        "take copies of frames out of the folder, since each counts as an observation of its own;"
+        " if the times are in whole seconds, give better ones",
+        {"frames": float(len(pairs))},
+    )
+
+
 def check_exif_times(times_s: Sequence[float], exif_s: Sequence[float]) -> Iterator[Doubt]:
     """Compare the times of frames with those that their EXIF has, both Unix UTC [s], in pairs.
 

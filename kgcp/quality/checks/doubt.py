@@ -77,6 +77,7 @@ class Cause(StrEnum):
     NO_OVERLAP = "no_overlap", "frames and trajectory are not of the same time"
     NO_TIMES = "no_times", "frames have no time"
     WHOLE_SECONDS = "whole_seconds", "frame times are whole seconds: too coarse, or cut"
+    SAME_TIMES = "same_times", "several frames have one time: copies, or times in whole seconds"
     FRAME_ORDER = "frame_order", "times or reference poses belong to the next or previous frame"
     REFERENCE = "reference", "reference poses are of another place, or turned"
     STATIC_TARGETS = (

@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.quality.checks.clock import check_exif_times, check_fractions, check_overlap
+from kgcp.quality.checks.clock import (
+    check_exif_times,
+    check_fractions,
+    check_overlap,
+    check_same_times,
+)
 from kgcp.quality.checks.doubt import Cause
 
 START_S = 1_781_597_700.0
@@ -82,3 +87,13 @@ def test_clocks_of_cameras_are_off_and_that_is_no_doubt() -> None:
 def test_times_of_other_frames_are_told() -> None:
     (doubt,) = check_exif_times([*FRAMES_S[::-1]], [*FRAMES_S])
     assert doubt.code is Cause.FRAME_ORDER
+
+
+def test_frames_with_the_time_of_another_are_counted() -> None:
+    times_s = {f"{number}.jpg": START_S + number for number in range(5)}
+    assert not [*check_same_times(times_s)]
+    (doubt,) = check_same_times(times_s | {"3 (1).jpg": START_S + 3, "4.tif": START_S + 4})
+    assert (doubt.code, doubt.is_grave) == (Cause.SAME_TIMES, False)
+    assert "2 of 7 frames have the time of another frame, such as 3.jpg that of 3 (1).jpg" in (
+        doubt.sentence
+    )
