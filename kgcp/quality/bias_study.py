@@ -20,6 +20,9 @@ from kgcp.georef.target_positions import NoPosition, TargetPosition, TargetPosit
 from kgcp.settings import Method
 from kgcp.targets.plain import AnyTarget
 
+_VAGUE_TIMES, _VAGUE_M = 10.0, 0.1
+"""A reference is vague beyond so many medians of the standard deviations, and so many metres."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _CameraPlace:
@@ -130,6 +133,8 @@ class BiasStudy:
     # called misplaced, and every frame with a pose counts as one that shows it.
     attitudes_agree: bool
     frames_without_pose: tuple[str, ...]  # frames that the reference does not name
+    # frames with a reference distance far less certain than most, as while GNSS is out
+    frames_with_vague_reference: tuple[str, ...]
     absences: tuple[NoPosition, ...]  # of the frames in which the position of the target is unknown
 
     def trusts(self, pair: Comparison) -> bool:
@@ -187,7 +192,7 @@ def study_bias(
     places = _camera_places(
         [attempt for attempt, _ in placed], poses, orientations, motions, camera
     )
-    compared = _compare_all(placed, places, camera, targets)
+    compared, vague = _without_vague(_compare_all(placed, places, camera, targets))
     measured = tuple(pair for pair in compared if pair.attempt.sighting is not None)
     agree = 2 * sum(pair.is_misplaced for pair in measured) < len(measured)
     return BiasStudy(
@@ -196,6 +201,7 @@ def study_bias(
         expected_visible=tuple(pair for pair in compared if not agree or pair.is_whole_in(camera)),
         attitudes_agree=agree,
         frames_without_pose=tuple(sorted({each.frame for each in ours} - has_pose)),
+        frames_with_vague_reference=vague,
         absences=tuple(position for position in positions if isinstance(position, NoPosition)),
     )
 
@@ -246,6 +252,22 @@ def _compare_all(
         )
         for (attempt, position), place, pixel in zip(placed, places, pixels, strict=True)
     ]
+
+
+def _without_vague(pairs: Sequence[Comparison]) -> tuple[list[Comparison], tuple[str, ...]]:
+    """Return the comparisons without those that say nothing beside the others, and their frames.
+
+    One error of metres, however honestly stated, would be most of an RMS over centimetres.
+    """
+    sds_m = [pair.sds.total_m for pair in pairs if pair.sds and pair.attempt.sighting]
+    most_m = max(_VAGUE_TIMES * float(np.median(sds_m)), _VAGUE_M) if sds_m else math.inf
+    kept, vague = [], set()
+    for pair in pairs:
+        if pair.sds is not None and pair.sds.total_m > most_m:
+            vague.add(pair.attempt.frame)
+        else:
+            kept.append(pair)
+    return kept, tuple(sorted(vague))
 
 
 def _with_measured_target(attempts: Sequence[Attempt]) -> list[Attempt]:

@@ -163,6 +163,21 @@ def test_frames_without_pose_or_place_are_counted() -> None:
     assert len(study.measured) == 2
 
 
+def test_a_reference_far_less_certain_than_the_others_is_not_compared() -> None:
+    poses = _nadir_poses(_ABOVE)
+    assert poses.sd_position_m is not None
+    sds = poses.sd_position_m.copy()
+    sds[1] = 0.8  # GNSS without ambiguities, and its error:
+    moved = poses.position_map + np.outer([0.0, 1.0, 0.0, 0.0], [0.7, 0.0, 1.1])
+    outage = replace(poses, position_map=moved, sd_position_m=sds)
+    study = study_bias(_attempts(), outage, _TARGET_POSITIONS, _CAMERA, [_TARGET], _METHOD)
+    assert study.frames_with_vague_reference == (_frame(1),)
+    assert len(study.measured) == len(study.trusted) == len(study.expected_visible) == 3
+    alike = replace(poses, sd_position_m=20.0 * poses.sd_position_m)
+    study = study_bias(_attempts(), alike, _TARGET_POSITIONS, _CAMERA, [_TARGET], _METHOD)
+    assert len(study.measured) == 4
+
+
 def test_second_plates_are_not_compared() -> None:
     attempts = _attempts()
     sighting = attempts[0].sighting

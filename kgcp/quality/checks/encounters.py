@@ -94,7 +94,7 @@ class Encounters:
             centre_m=orientations.centre_m[row],
             enu_from_camera=orientations.enu_from_camera[row],
             opk_deg=poses.opk_deg[row],
-            variance_m2=_variance_m2(used, vehicle, poses, row),
+            variance_m2=_variance_m2(used, vehicle, poses, row, time_s),
             frame_from_ned=np.broadcast_to(ENU_FROM_NED, (len(row), 3, 3)),
         )
         place = draft.at(time_s).position_m
@@ -175,7 +175,11 @@ def misfit_of(offset_m: FloatArray, variance_m2: FloatArray) -> float:
 
 
 def _variance_m2(
-    sightings: Sequence[Sighting], vehicle: Vehicle, poses: ReferencePoses, row: list[int]
+    sightings: Sequence[Sighting],
+    vehicle: Vehicle,
+    poses: ReferencePoses,
+    row: list[int],
+    time_s: FloatArray,
 ) -> FloatArray:
     """Return variances (n,) [m²]: all errors as if they pointed in any direction."""
     settings, motion = vehicle.settings, vehicle.motion
@@ -188,7 +192,8 @@ def _variance_m2(
         total += np.square(sds)
     total += max(settings.sd_lever_arm_m) ** 2
     if motion.sd_position_m is not None:
-        total += float(np.median(motion.sd_position_m.max(axis=1))) ** 2
+        worst_m = motion.sd_position_m.max(axis=1)
+        total += np.interp(time_s, motion.time_s, worst_m) ** 2  # large while GNSS is out
     if poses.sd_position_m is not None:
         total += poses.sd_position_m[row].max(axis=1) ** 2
     if poses.sd_angle_deg is not None:

@@ -188,6 +188,8 @@ def bias_numbers(study: BiasStudy) -> BiasNumbers:
     left_out = Counter(absence.value for absence in study.absences)
     if study.frames_without_pose:
         left_out["no_reference_pose"] = len(study.frames_without_pose)
+    if study.frames_with_vague_reference:
+        left_out["vague_reference"] = len(study.frames_with_vague_reference)
     return BiasNumbers(
         compared=tuple(compared),
         data=data,

@@ -10,6 +10,10 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import ReferencePoses
+from kgcp.geometry.camera import Camera
+from kgcp.georef.sighting import Sighting
+from kgcp.georef.target_positions import TargetPositions
 from kgcp.georef.trajectory import Motion
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import read_flight
@@ -31,14 +35,20 @@ def encounters(tmp_path_factory: pytest.TempPathFactory) -> Encounters:
 
 
 def of(folder: Path, camera: Mapping[str, float]) -> Encounters:
+    found = Encounters.of(*inputs_of(folder, camera))
+    assert found is not None
+    return found
+
+
+def inputs_of(
+    folder: Path, camera: Mapping[str, float]
+) -> tuple[list[Sighting], TargetPositions, ReferencePoses, Camera]:
     replace(flight(), camera=camera).write(folder)
     read = read_flight(folder)
     attempts = read_attempts(folder / "kgcp" / "detections.parquet", read)
     data = FlightData(read, [attempt.frame for attempt in attempts])
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
-    found = Encounters.of(sightings, data.target_positions, data.reference_poses, read.camera)
-    assert found is not None
-    return found
+    return sightings, data.target_positions, data.reference_poses, read.camera
 
 
 def test_a_correct_flight_fits_and_needs_no_cause(encounters: Encounters) -> None:
@@ -178,6 +188,26 @@ def test_a_lone_frame_is_counted(encounters: Encounters) -> None:
     (doubt,) = check_lone_frames(moved(encounters, shift))
     assert doubt.figures["frames"] == 1.0
     assert "up to 3.0 m apart" in doubt.sentence
+
+
+def test_a_lone_frame_while_gnss_is_out_is_as_good_as_its_deviations_say(tmp_path: Path) -> None:
+    flight_inputs = inputs_of(tmp_path / "flight", CAMERA)
+    sightings, positions, poses, camera = flight_inputs
+    vehicle = positions.vehicle
+    assert vehicle is not None
+    assert vehicle.motion.sd_position_m is not None
+    usual = Encounters.of(*flight_inputs)
+    assert usual is not None
+    is_out = np.abs(vehicle.motion.time_s - usual.time_s[4]) < 0.5
+    sd_m = np.where(is_out[:, None], 2.0, vehicle.motion.sd_position_m)
+    motion = replace(vehicle.motion, sd_position_m=sd_m)
+    outage = replace(positions, vehicle=replace(vehicle, motion=motion))
+    found = Encounters.of(sightings, outage, poses, camera)
+    assert found is not None
+    shift = np.zeros_like(found.centre_m)
+    shift[4, 0] = 3.0
+    assert [*check_lone_frames(moved(usual, shift))]
+    assert not [*check_lone_frames(moved(found, shift))]
 
 
 def test_a_mount_between_right_angles_is_named_as_seen(encounters: Encounters) -> None:
