@@ -44,7 +44,8 @@ Agisoft Metashape (Professional)
      of these. It concerns also other markers of the chunk;
    - positions and angles of cameras, if cameras.csv is here, where the photos have none of their
      own. They come from the plate and its vehicle's attitude and are weak.
-   The script may be run again, after another export; it prints what it has set.
+   The script may be run again, after another export: moving points and scale bars that are no
+   longer in the files go. It prints what it has set.
 3. Optimise the cameras (Reference > Optimize Cameras).
 
 Every scale bar has the weight of its own accuracy. Metashape ignores correlations.

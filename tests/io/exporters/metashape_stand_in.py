@@ -90,11 +90,17 @@ class Projections:
         self._projections: dict[int, tuple[Camera, Projection]] = {}
 
     def __setitem__(self, camera: object, projection: object) -> None:
+        if isinstance(camera, Camera) and projection is None:
+            self._projections.pop(camera.key, None)
+            return
         if not isinstance(camera, Camera) or not isinstance(projection, Projection):
             raise TypeError(f"{camera!r}: {projection!r}")
         if len(projection.coord) != 2:
             raise ValueError("a projection has two coordinates")
         self._projections[camera.key] = (camera, projection)
+
+    def keys(self) -> list[Camera]:
+        return [camera for camera, _ in self._projections.values()]
 
     def items(self) -> list[tuple[Camera, Projection]]:
         return [*self._projections.values()]
@@ -195,6 +201,11 @@ class Chunk(Documented):
         self.scalebars.append(Scalebar(point1, point2))
         return self.scalebars[-1]
 
+    def remove(self, items: list[Marker | Scalebar]) -> None:
+        for item in items:
+            group: list[Any] = self.markers if isinstance(item, Marker) else self.scalebars
+            group.remove(item)
+
 
 class Document(Documented):
     chunk = Attribute(Chunk, None)
@@ -215,6 +226,7 @@ def run_script(text: str, path: Path, chunk: Chunk | None) -> None:
     application.document = document
     documented = {
         "app": application,
+        "Camera": Camera,
         "CoordinateSystem": CoordinateSystem,
         "EulerAnglesOPK": OPK,
         "EulerAnglesYPR": YPR,

@@ -110,6 +110,37 @@ def test_one_run_sets_everything_whatever_the_labels(
     assert bar.reference.enabled
 
 
+def test_a_run_after_another_export_leaves_nothing_of_the_earlier_one(
+    points: MapPoints, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Frames were added or left out: numbers go to other frames, and the last ones are free."""
+    chunk = chunk_of(*STEMS)
+    pillar, other = chunk.addMarker(), chunk.addMarker()
+    pillar.label, other.label = "K0099", "south-K0009"  # a surveyor's, and another flight's
+    chunk.addScalebar(other, chunk.cameras[0]).label = "south-K0009_IMG_1.JPG"
+    run(points, tmp_path, chunk)
+    fewer = [point for point in points.gcps if point.id.startswith("K")][1:4]
+    renumbered = [
+        replace(point, id=f"K{number:04d}", is_checkpoint=number == 3)
+        for number, point in enumerate(fewer, start=1)
+    ]
+    gate = [point for point in points.gcps if point.id == "north gate"]
+    run(replace(points, gcps=(*renumbered, *gate), priors=()), tmp_path, chunk)
+    seen = {
+        each.label: [camera.key + 1 for camera in each.projections.keys()]  # noqa: SIM118 - Metashape's
+        for each in chunk.markers
+    }
+    assert {label: seen[label] for label in ("K0001", "K0002", "K0003")} == {
+        point.id: [int(point.frame.partition("_")[2].partition(".")[0])] for point in renumbered
+    }
+    assert "K0004" not in seen
+    assert {"K0099", "south-K0009", "north_gate"} <= seen.keys()
+    bars = {bar.label for bar in chunk.scalebars if bar.point0.label[0] == "K"}
+    assert bars == {f"{point.id}_{point.frame.partition('/')[2]}" for point in renumbered[:2]}
+    assert "south-K0009_IMG_1.JPG" in {bar.label for bar in chunk.scalebars}
+    assert "of an earlier run removed" in capsys.readouterr().out
+
+
 def test_cameras_without_a_position_get_kgcps(points: MapPoints, tmp_path: Path) -> None:
     chunk = chunk_of(*STEMS)
     run(points, tmp_path, chunk)
