@@ -23,6 +23,11 @@ _SAME_SHARE = 0.02  # of the interval between frames
 _MOST_OUTSIDE = 0.1  # of the frames: some are taken before a logger starts
 _MOSTLY = 0.5
 _FEWEST_WHOLE = 5  # times; fewer may be whole seconds by chance
+_CHECK_DATES = (
+    "check the date and GPS week of both files: [vehicle] date names the first day of a trajectory"
+    " in seconds of the week"
+)
+"""Not time_offset_s, with which points would have the time of the wrong day."""
 
 
 def clock_shifts_s() -> Iterator[tuple[float, str]]:
@@ -77,11 +82,14 @@ def check_overlap(
     for shift_s, words in clock_shifts_s():
         if np.mean((times + shift_s >= first) & (times + shift_s <= last)) > 1.0 - 0.02:
             which = "later" if shift_s > 0.0 else "earlier"
+            remedy = (
+                "give [vehicle] time_system, correct the times file, or set [vehicle]"
+                f" time_offset_s = {time_offset_s + shift_s:g}"
+            )
             yield doubt(
                 Cause.CLOCK,
                 f"{sentence}: {words}; {_seconds(abs(shift_s))} {which} all would lie inside",
-                "give [vehicle] time_system, correct the times file, or set [vehicle]"
-                f" time_offset_s = {time_offset_s + shift_s:g}",
+                _CHECK_DATES if shift_s % _DAY_S == 0.0 else remedy,
                 {**figures, "shift_s": shift_s},
             )
             return
@@ -92,8 +100,7 @@ def check_overlap(
         yield grave(
             Cause.CLOCK,
             f"{sentence}: they are {words} apart",
-            "check the date and GPS week of both files: [vehicle] date names the first day of"
-            " a trajectory in seconds of the week",
+            _CHECK_DATES,
             {**figures, "shift_s": days * _DAY_S},
         )
     elif outside == 1.0:  # blocks partly inside are flown for longer than vehicles drive

@@ -52,6 +52,11 @@ def test_whole_seconds_are_told() -> None:
 def test_the_shift_that_fits_is_named(ahead_s: float, words: str) -> None:
     (doubt,) = check_overlap(FRAMES_S + ahead_s, TRAJECTORY_S, 0.0)
     assert (doubt.code, doubt.is_grave) == (Cause.CLOCK, abs(ahead_s) > 20.0)
+    is_date = ahead_s % 86_400.0 == 0.0
+    assert ("[vehicle] date" in doubt.remedy, "time_offset_s" in doubt.remedy) == (
+        is_date,
+        not is_date,
+    )
     assert words in doubt.sentence
     assert doubt.figures["shift_s"] == pytest.approx(-ahead_s)
 
