@@ -23,11 +23,13 @@ from kgcp.quality.checks.clock import time_span
 from kgcp.quality.checks.doubt import Doubt, ranked
 from kgcp.quality.checks.lever_arm import lever_arm_text
 from kgcp.quality.checks.place import place_text
+from kgcp.quality.number_text import rounded
 from kgcp.settings import DetectSettings
 from kgcp.simulation.outlook import least_plain_px
 from kgcp.targets.plain import PlainTarget
 
 _TYPICAL_M = 50.0  # a distance to name, where no reference tells any
+_UNEVEN = 10.0  # times the median, from which the largest standard deviation is named
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,8 +195,10 @@ def _trajectory_text(inputs: FlightInputs) -> str:
 def _sds_text(sd_position_m: FloatArray | None) -> str:
     if sd_position_m is None:
         return ", no standard deviations"
-    values = 100.0 * np.median(sd_position_m, axis=0)
-    return ", σ " + "/".join(f"{value:.2g}" for value in values.tolist()) + " cm"
+    usual_cm, worst_cm = 100.0 * np.median(sd_position_m, axis=0), 100.0 * sd_position_m.max()
+    text = f", σ {'/'.join(map(rounded, usual_cm.tolist()))} cm"
+    is_uneven = worst_cm > _UNEVEN * usual_cm.max()  # as while GNSS is out
+    return f"{text}, at worst {rounded(worst_cm)} cm" if is_uneven else text
 
 
 def _overlap_text(inputs: FlightInputs) -> str:

@@ -15,6 +15,11 @@ def minus(number: str) -> str:
     return number.replace("-", "−") if float(number) else number.lstrip("+-")
 
 
+def rounded(value: float) -> str:
+    """Return a number of two digits, or as a whole number, never with an exponent."""
+    return f"{value:.2g}" if abs(value) < 99.5 else f"{value:.0f}"
+
+
 def amount(value: float, sd: float | None, sign: str = "") -> str:
     """Return value ± standard deviation, both to the second digit of the latter.
 

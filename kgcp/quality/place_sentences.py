@@ -11,7 +11,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.georef.camera_priors import MIN_AMBIGUITY
 from kgcp.georef.scene_rotation import CameraMotions
 from kgcp.network.ground.target_places import PlacedTarget, Placement
-from kgcp.quality.number_text import minus
+from kgcp.quality.number_text import minus, rounded
 
 _DOUBTFUL = 3.0  # standard deviations
 _DOUBTFUL_CHI2 = 14.2  # of three coordinates, as likely as 3 standard deviations of one
@@ -100,7 +100,9 @@ def step_sentence(placement: Placement) -> str:
     if not stepped:
         return ""
     target, step = max(stepped, key=lambda each: each[1].distance_m)
-    images = f"from {step.frame} on, its images show another place, by about {step.distance_m:.2g}"
+    images = (
+        f"from {step.frame} on, its images show another place, by about {rounded(step.distance_m)}"
+    )
     if len(stepped) == 1:
         return (
             f"{target}: {images} m: the reference poses step or drift, or it was moved, which one"

@@ -58,6 +58,21 @@ def test_the_page_of_a_correct_flight(flight: Path) -> None:
     assert stored.stdout == result.stdout
 
 
+def test_the_worst_of_uneven_deviations_is_named(flight: Path) -> None:
+    """GNSS without ambiguities for a second, and a receiver without corrections."""
+    text = (flight / "vehicle.csv").read_text(encoding="utf-8")
+    header, *lines = text.splitlines()
+    cells = [line.split(",") for line in lines]
+    for row in cells[200:220]:
+        row[7:10] = ["0.8", "0.8", "1.5"]
+    (flight / "vehicle.csv").write_text("\n".join([header, *map(",".join, cells)]) + "\n")
+    assert "σ 1/1/1.8 cm, at worst 150 cm" in " ".join(check(flight).stdout.split())
+    for row in cells:
+        row[7:10] = ["1.2", "1.2", "2.5"]
+    (flight / "vehicle.csv").write_text("\n".join([header, *map(",".join, cells)]) + "\n")
+    assert "σ 120/120/250 cm\n" in check(flight).stdout.replace("\n              ", " ")
+
+
 def test_json_has_facts_and_doubts(flight: Path) -> None:
     change(flight, "flight.toml", "fx = 1903.0", "fx = 8.8")
     result = check(flight, "--json")

@@ -33,6 +33,7 @@ from kgcp.network.ground.position_check import WrongPosition, wrong_position
 from kgcp.network.ground.resection import MIN_POINTS
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
+from kgcp.quality.number_text import rounded
 
 _SIGNIFICANT = 3.0  # standard deviations of what all distances are off by
 
@@ -133,7 +134,7 @@ class FlightPoses:
             first, *others = wrong.targets
             doubts.append(
                 "the positions of the targets contradict each other: that of"
-                f" {first} is off by {wrong.off_m:.2g} m"
+                f" {first} is off by {rounded(wrong.off_m)} m"
                 + (f", or that of {' or '.join(others)} is wrong" if others else "")
                 + f" (χ² {wrong.chi2:.0f} of 3), or a diameter is wrong; poses may be off by more"
                 " than is stated"

@@ -15,6 +15,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
+from kgcp.quality.number_text import rounded
 
 _CONTRADICTION = 5.0  # standard deviations of a distance between two targets in one frame
 _LEAST_SHARE, _LEAST_FRAMES = 0.25, 2  # of the frames with two targets, that must contradict
@@ -186,7 +187,7 @@ def _of_targets(
     off_m = float(np.median([_off_m(pair, scale) for pair in bad[worst]]))
     return grave(
         Cause.STATIC_TARGETS,
-        f"static targets: {worst[0]} and {worst[1]} are {abs(off_m):.2g} m"
+        f"static targets: {worst[0]} and {worst[1]} are {rounded(abs(off_m))} m"
         f" {'further from' if off_m > 0.0 else 'nearer to'} each other by their images than by"
         f" position_m, in {len(bad[worst])} of {len(by_names[worst])} frames;"
         f" {_and(blamed)} contradict{'s' * (len(blamed) == 1)} most others",

@@ -9,7 +9,7 @@ from enum import IntEnum
 from statistics import median
 
 from kgcp.quality.bias_causes import Term
-from kgcp.quality.number_text import counted
+from kgcp.quality.number_text import counted, rounded
 from kgcp.report.bias.numbers import BiasNumbers, RangeRow
 from kgcp.report.bias.reexposure import GAINS, Reexposed
 from kgcp.report.bias.wording import (
@@ -139,7 +139,7 @@ def _mean(row: RangeRow) -> str:
     text = signed_amount(row.percent.mean, row.percent.sd_mean, "%")
     if row.sd_reference_percent is None:
         return text
-    return f"{text} (the reference allows ± {row.sd_reference_percent:.2g} %)"
+    return f"{text} (the reference allows ± {rounded(row.sd_reference_percent)} %)"
 
 
 def _causes(numbers: BiasNumbers) -> Iterator[Finding]:
@@ -258,7 +258,7 @@ def _detection(numbers: BiasNumbers) -> Iterator[Finding]:
 def _reservations(numbers: BiasNumbers) -> Iterator[Finding]:
     """Yield the reservations against the numbers."""
     if numbers.sd_reference_m is not None:
-        text = f"Reference distances are known to {1000.0 * numbers.sd_reference_m:.2g} mm"
+        text = f"Reference distances are known to {rounded(1000.0 * numbers.sd_reference_m)} mm"
         sds_m = [
             pair.attempt.sighting.sd_distance_m
             for pair in numbers.compared
@@ -266,7 +266,7 @@ def _reservations(numbers: BiasNumbers) -> Iterator[Finding]:
         ]
         stated_m = [sd_m for sd_m in sds_m if sd_m is not None]
         if stated_m:
-            text += f", measured ones to {1000.0 * median(stated_m):.2g} mm"
+            text += f", measured ones to {rounded(1000.0 * median(stated_m))} mm"
         yield Finding(FlightGrade.GOOD, f"{text} (median standard deviations).", "error")
     if not numbers.attitudes_agree:
         yield Finding(

@@ -6,7 +6,7 @@ from kgcp.measurement.records import ToneBase
 from kgcp.quality.bias_causes import Regression, Term
 from kgcp.quality.exposure_effects import QUANTITIES
 from kgcp.quality.learnt_imaging import LearntImaging
-from kgcp.quality.number_text import amount, counted, minus
+from kgcp.quality.number_text import amount, counted, minus, rounded
 from kgcp.report.bias.numbers import BiasNumbers
 
 LABELS = {
@@ -40,9 +40,9 @@ def value_of(term: Term) -> str:
 def reference_allows(term: Term, numbers: BiasNumbers) -> str | None:
     """Return what errors of the reference distances may feign of a term; None: not known."""
     if term.name == "scale" and numbers.total.sd_reference_percent is not None:
-        return f"± {numbers.total.sd_reference_percent:.2g} %"
+        return f"± {rounded(numbers.total.sd_reference_percent)} %"
     if term.name == "offset_m" and numbers.sd_reference_m is not None:
-        return f"± {1000.0 * numbers.sd_reference_m:.2g} mm"
+        return f"± {rounded(1000.0 * numbers.sd_reference_m)} mm"
     return None
 
 
