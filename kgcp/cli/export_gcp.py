@@ -277,7 +277,8 @@ def _export(
         try:
             written += write(name)
         except KgcpError as error:
-            if name in formats:
+            is_of_files = isinstance(error.__cause__, OSError)  # a full disk, and not the format
+            if name in formats or is_of_files:
                 raise
             left_out[name] = str(error)
     return written, left_out
@@ -339,9 +340,12 @@ def _reasons(points: GcpSet | MergedGcps) -> Counter[str]:
 
 
 def _counted(points: GcpSet | MergedGcps) -> str:
+    from kgcp.quality.number_text import counted
+
     checks = sum(point.is_checkpoint for point in points.gcps)
-    of_these = f" ({checks} check points)" if checks else ""
-    return f"{len(points.gcps)} KGCPs{of_these}, {len(points.skipped)} sightings left out"
+    of_these = f" ({counted(checks, 'check point')})" if checks else ""
+    lost = counted(len(points.skipped), "sighting")
+    return f"{counted(len(points.gcps), 'KGCP')}{of_these}, {lost} left out"
 
 
 def _report_part(part: GcpSet) -> None:

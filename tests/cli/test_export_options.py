@@ -131,6 +131,13 @@ def test_the_summary_says_what_to_change_and_heeding_it_ends_it(folder: Path) ->
     assert json.loads(_export(folder, "--json").stdout)["advice"] == []
 
 
+def test_files_that_cannot_be_written_are_no_reason_to_leave_a_format_out(folder: Path) -> None:
+    (folder / "kgcp" / "odm").write_text("a file, where a folder must be")
+    result = CliRunner().invoke(main, ["export-gcp", str(folder), "--format", "all"])
+    assert result.exit_code == 1
+    assert f"{folder / 'kgcp' / 'odm' / 'gcp_list.txt'}: cannot be written" in result.stderr
+
+
 @pytest.mark.parametrize("command", ["export-gcp", "bias-report", "place", "orient"])
 def test_another_results_folder_needs_the_table_of_detections(folder: Path, command: str) -> None:
     out, table = folder / "other", folder / "kgcp" / "detections.parquet"
