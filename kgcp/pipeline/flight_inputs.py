@@ -34,7 +34,11 @@ from kgcp.quality.checks.clock import (
     check_same_times,
 )
 from kgcp.quality.checks.course import Course, check_attitude, course_of
-from kgcp.quality.checks.deviations import check_deviations, check_pose_deviations
+from kgcp.quality.checks.deviations import (
+    check_deviations,
+    check_pose_deviations,
+    check_vehicle_deviations,
+)
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild, ranked
 from kgcp.quality.checks.frame_header import FrameHeader, check_frames
 from kgcp.quality.checks.lever_arm import check_lever_arm
@@ -228,6 +232,7 @@ class FlightInputs:
         ]
         if flight.vehicle is not None:
             doubts += check_lever_arm(flight.vehicle.settings)
+            doubts += check_vehicle_deviations(flight.vehicle.settings)
         if self.target_positions is not None and not _has_wrong_places(doubts):
             doubts += check_attitude(self.course)
             if self.target_positions.vehicle is not None:

@@ -150,7 +150,7 @@ class Flight:
             "sd_heading_deg",
             [f"{t:.6f}" for t in self.vehicle_s],
             self.vehicle,
-            (*self._sds(0.01, 0.018), 0.02, 0.02, 0.05),
+            (0.01, 0.01, 0.018, 0.02, 0.02, 0.05),
         )
         if self.reference is not None:
             self._write_table(
@@ -158,16 +158,10 @@ class Flight:
                 "frame,x,y,z,omega_deg,phi_deg,kappa_deg,sd_x,sd_y,sd_z,sd_angle_deg",
                 self.reference_frames,
                 self.reference,
-                (*self._sds(0.004, 0.004), 0.003),
+                (0.004, 0.004, 0.004, 0.003),
             )
         rows = [self._detection(index) for index in range(len(self.frames))]
         write_table(folder / "kgcp" / "detections.parquet", DETECTION_COLUMNS, rows, {})
-
-    def _sds(self, flat_m: float, up_m: float) -> tuple[float, float, float]:
-        """Standard deviations in the units of the map's axes."""
-        is_angular = np.abs(self.vehicle[0, :2]).max() < 400.0
-        flat = flat_m / 111_000.0 if is_angular else flat_m
-        return flat, flat, up_m
 
     @staticmethod
     def _write_table(

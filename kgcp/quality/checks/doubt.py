@@ -68,7 +68,7 @@ class Cause(StrEnum):
     )
     STANDARD_DEVIATIONS = (
         "standard_deviations",
-        "standard deviations of trajectory or reference poses are 0, as of nothing measured",
+        "standard deviations are 0, as of nothing measured, or seem to be in another unit",
     )
     LEVER_ARM = "lever_arm", "an axis of the lever arm has the wrong sign, place or unit"
     MOUNT = "mount_deg", "the plate is mounted in another direction than mount_deg says"

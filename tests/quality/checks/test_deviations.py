@@ -3,11 +3,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.georef.trajectory import Motion
-from kgcp.quality.checks.deviations import check_deviations, check_pose_deviations
+from kgcp.quality.checks.deviations import (
+    check_deviations,
+    check_pose_deviations,
+    check_vehicle_deviations,
+)
 from kgcp.quality.checks.doubt import Cause
+from kgcp.settings import VehicleSettings
 
 _SD = np.full((5, 3), 0.02)
 _MOTION = Motion(np.arange(5.0), np.zeros((5, 3)), np.tile(np.eye(3), (5, 1, 1)), _SD, _SD)
@@ -50,3 +57,27 @@ def test_reference_poses_with_deviations_of_zero_are_doubted() -> None:
     assert {position.code, angle.code} == {Cause.STANDARD_DEVIATIONS}
     assert "reference poses' positions are 0 in all poses" in position.sentence
     assert "reference poses' angles are 0 in 2 of 5 poses" in angle.sentence
+
+
+@pytest.mark.parametrize(
+    ("factors", "words"),
+    [
+        (1000.0, "are 20 m (median), as millimetres would be"),
+        (0.02, "are 0.0004 m (median), as variances or degrees"),
+        ([1e-5, 1e-5, 1.0], "are 2e-07 m (median), as variances or degrees"),
+    ],
+)
+def test_deviations_of_another_unit_are_doubted(factors: FloatArray, words: str) -> None:
+    (doubt,) = check_deviations(replace(_MOTION, sd_position_m=_SD * factors))
+    assert words in doubt.sentence
+    assert (doubt.code, doubt.is_grave) == (Cause.STANDARD_DEVIATIONS, False)
+
+
+def test_deviations_of_the_vehicle_in_thousandths_are_doubted() -> None:
+    usual = VehicleSettings(sd_lever_arm_m=(0.005, 0.005, 0.01), sd_time_s=0.02)
+    assert not [*check_vehicle_deviations(usual)]
+    wrong = VehicleSettings(sd_lever_arm_m=(3.0, 3.0, 5.0), sd_time_s=1.0)
+    arm, time = check_vehicle_deviations(wrong)
+    assert arm.sentence.startswith("[vehicle] sd_lever_arm_m is 5 m, which makes all points as unc")
+    assert arm.remedy == "give it in m, not in mm"
+    assert time.sentence.startswith("[vehicle] sd_time_s is 1 s")
