@@ -71,24 +71,15 @@ def _far(poses: ReferencePoses, vehicle: Vehicle, ground: FloatArray, off_m: flo
     """Return the doubt about poses far away, by the first slip without which they are near."""
     figures = {"distance_m": off_m}
     sentence = f"reference poses and trajectory are {off_m / 1000.0:.4g} km apart at least"
+    # either file exchanged looks the same, where both places exist
     swapped_poses = poses.position_map[:, [1, 0, 2]]
-    if _distance(swapped_poses, vehicle, ground) < _FAR_M:
+    if _distance(swapped_poses, vehicle, ground) < _FAR_M or _fits_swapped(poses, vehicle, ground):
         return grave(
             Cause.AXES_SWAPPED,
-            f"{sentence}: with x and y of the reference poses exchanged they fit",
-            "put the easting (or longitude) of the poses into x and the northing into y",
-            figures,
-        )
-    on_map = vehicle.local_frame.map_from_enu(ground[:1])[:, [1, 0, 2]]
-    try:
-        moved = vehicle.local_frame.enu_from_map(on_map)
-    except KgcpError:
-        moved = None
-    if moved is not None and _distance(poses.position_map, vehicle, moved) < _FAR_M:
-        return grave(
-            Cause.AXES_SWAPPED,
-            f"{sentence}: with x and y of the trajectory exchanged they fit",
-            "put the easting (or longitude) of the trajectory into x and the northing into y",
+            f"{sentence}: with x and y of the reference poses, or else of the trajectory,"
+            " exchanged they fit",
+            "find out which of the two is elsewhere, and put its easting (or longitude) into x and"
+            " its northing into y",
             figures,
         )
     for words, convert in _UNITS:
@@ -106,6 +97,16 @@ def _far(poses: ReferencePoses, vehicle: Vehicle, ground: FloatArray, off_m: flo
         " hemispheres",
         figures,
     )
+
+
+def _fits_swapped(poses: ReferencePoses, vehicle: Vehicle, ground: FloatArray) -> bool:
+    """Whether the poses are near the trajectory with x and y of the latter exchanged."""
+    on_map = vehicle.local_frame.map_from_enu(ground[:1])[:, [1, 0, 2]]
+    try:
+        moved = vehicle.local_frame.enu_from_map(on_map)
+    except KgcpError:
+        return False
+    return _distance(poses.position_map, vehicle, moved) < _FAR_M
 
 
 _UNITS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (

@@ -42,7 +42,8 @@ def test_cameras_above_the_vehicle_raise_no_doubt() -> None:
 @pytest.mark.parametrize(
     ("camera", "ground", "code", "words"),
     [
-        (PLACE[[1, 0, 2]], PLACE, Cause.AXES_SWAPPED, "of the reference poses exchanged"),
+        (PLACE[[1, 0, 2]], PLACE, Cause.AXES_SWAPPED, "poses, or else of the trajectory, exch"),
+        (PLACE, PLACE[[1, 0, 2]], Cause.AXES_SWAPPED, "poses, or else of the trajectory, exch"),
         (np.radians(PLACE), PLACE, Cause.ANGLE_UNIT, "of the poses in radians"),
         (PLACE + np.array([1.0, 0.0, 0.0]), PLACE, Cause.REFERENCE, "74.34 km apart"),
         (PLACE - np.array([0.0, 0.0, 100.0]), PLACE, Cause.HEIGHTS, "40.0 m below the vehicle"),
