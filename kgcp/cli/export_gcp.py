@@ -22,6 +22,7 @@ from kgcp.cli.options import (
 from kgcp.io.exporters.formats import DEFAULT_FORMATS, FORMATS
 
 if TYPE_CHECKING:
+    from kgcp.georef.gcp import Gcp
     from kgcp.georef.selection import Selection
     from kgcp.georef.target_positions import Vehicle
     from kgcp.io.flight.flight import Flight
@@ -351,6 +352,7 @@ def _counted(points: GcpSet | MergedGcps) -> str:
 def _report_part(part: GcpSet) -> None:
     for reason, times in _reasons(part).most_common():
         click.echo(f"  {times:6d} {reason}", err=True)
+    _report_accuracy(part.gcps)
     _report_deviations(part.vehicle)
     if part.consistency is not None:
         _report_consistency(part.consistency)
@@ -367,6 +369,14 @@ def _named(written: list[Path]) -> list[str]:
         for path in written
     )
     return [*dict.fromkeys(names)]
+
+
+def _report_accuracy(gcps: Sequence[Gcp]) -> None:
+    from kgcp.pipeline.export import accuracy_text
+
+    text = accuracy_text(gcps)
+    if text:
+        click.echo(text, err=True)
 
 
 def _report_deviations(vehicle: Vehicle | None) -> None:

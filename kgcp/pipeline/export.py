@@ -32,6 +32,7 @@ from kgcp.pipeline.flight_inputs import FlightInputs, naming_causes
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.checks.doubt import Doubt
 from kgcp.quality.consistency import Consistency
+from kgcp.quality.number_text import rounded
 
 _DEFAULT_SELECTION = Selection()
 
@@ -155,6 +156,17 @@ def _sightings(
     if not sightings:
         raise KgcpError(f"{table}: all {len(measured)} sightings are excluded; exclude fewer")
     return sightings, excluded
+
+
+def accuracy_text(gcps: Sequence[Gcp]) -> str:
+    """Return how well points are known, in words; nothing where no deviations are known."""
+    variances = [np.diag(point.cov_m2) for point in gcps if point.cov_m2 is not None]
+    if not variances:
+        return ""
+    sds_cm = 100.0 * np.sqrt(variances)
+    usual = "/".join(map(rounded, np.median(sds_cm, axis=0).tolist()))
+    worst = rounded(float(sds_cm.max()))
+    return f"standard deviations of x/y/z: {usual} cm (median), at worst {worst} cm"
 
 
 @single_threaded()

@@ -131,6 +131,17 @@ def test_the_summary_says_what_to_change_and_heeding_it_ends_it(folder: Path) ->
     assert json.loads(_export(folder, "--json").stdout)["advice"] == []
 
 
+def test_the_summary_says_how_well_the_points_are_known(folder: Path) -> None:
+    stderr = _export(folder).stderr
+    with (folder / "kgcp" / "kgcps.csv").open(encoding="utf-8") as stream:
+        cells = [*csv.DictReader(stream)]
+    sds_cm = 100.0 * np.array([[float(row[f"sd_{axis}"]) for axis in "xyz"] for row in cells])
+    usual = "/".join(f"{value:.2g}" for value in np.median(sds_cm, axis=0))
+    worst = f"{sds_cm.max():.2g}"
+    line = f"standard deviations of x/y/z: {usual} cm (median), at worst {worst} cm\n"
+    assert line in stderr
+
+
 def test_files_that_cannot_be_written_are_no_reason_to_leave_a_format_out(folder: Path) -> None:
     (folder / "kgcp" / "odm").write_text("a file, where a folder must be")
     result = CliRunner().invoke(main, ["export-gcp", str(folder), "--format", "all"])
