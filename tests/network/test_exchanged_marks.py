@@ -54,7 +54,7 @@ def test_exchanged_marks_are_told_from_right_ones(
 def test_names_that_are_exchanged_in_a_cycle_are_found(count: int, length: int) -> None:
     """Each of some targets has the mark of the one before, as if counted from the wrong one."""
     rng = np.random.default_rng(7)
-    for _ in range(5):
+    for _ in range(2):
         marks, positions = marked_frame(rng, count, 10.0)
         names = [*marks][:length]
         exchanged = {**marks, **{name: marks[names[at - 1]] for at, name in enumerate(names)}}
