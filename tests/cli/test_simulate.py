@@ -15,10 +15,21 @@ from kgcp.simulation.effects import Effects, with_effects
 from kgcp.simulation.presets import PRESETS, preset
 
 
+@pytest.fixture
+def _small_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let all presets have frames of a tenth of their pixels, as rendering takes most time."""
+    for name, settings in list(PRESETS.items()):
+        camera = replace(
+            settings.camera, width=512, height=384, fx=738.0, fy=736.6, cx=253.3, cy=192.9
+        )
+        monkeypatch.setitem(PRESETS, name, replace(settings, camera=camera))
+
+
 def test_every_preset_can_be_chosen() -> None:
     assert tuple(PRESETS) == PRESET_NAMES
 
 
+@pytest.mark.usefixtures("_small_frames")
 def test_a_flight_is_written_and_summarised(tmp_path: Path) -> None:
     out = tmp_path / "flight"
     arguments = ["simulate", str(out), "--preset", "far", "--frames", "2", "--jobs", "1", "--json"]
@@ -31,6 +42,7 @@ def test_a_flight_is_written_and_summarised(tmp_path: Path) -> None:
     assert command in (out / "README.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.usefixtures("_small_frames")
 def test_survey_errors_can_be_left_out(tmp_path: Path) -> None:
     out = tmp_path / "flight"
     arguments = ["simulate", str(out), "--frames", "1", "--jobs", "1", "--no-survey-errors"]
@@ -110,6 +122,7 @@ def test_a_camera_that_sharpens_is_not_stated_to_be_linear() -> None:
     assert sharpened.camera.response is Response.UNKNOWN
 
 
+@pytest.mark.usefixtures("_small_frames")
 def test_options_of_effects_reach_the_flight_and_its_readme(tmp_path: Path) -> None:
     out = tmp_path / "flight"
     options = [
@@ -132,6 +145,7 @@ def test_options_of_effects_reach_the_flight_and_its_readme(tmp_path: Path) -> N
         assert frame.mode == "RGB"
 
 
+@pytest.mark.usefixtures("_small_frames")
 @pytest.mark.parametrize(
     "options", ["--phone", "--sharpening 0 1 --phone", "--sharpening 0.8 1.2 --no-phone"]
 )
