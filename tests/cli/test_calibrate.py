@@ -60,6 +60,15 @@ def run(*arguments: object) -> Result:
     return CliRunner().invoke(main, ["calibrate", *map(str, arguments)], catch_exceptions=False)
 
 
+@pytest.fixture
+def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave figures to the tests of the page: to draw them takes longer than to calibrate."""
+    names = ("residuals", "photographs", "rays", "distortion", "eccentricity", "field")
+    monkeypatch.setattr(
+        "kgcp.pipeline.calibration.results.draw_figures", lambda *_: dict.fromkeys(names, b"")
+    )
+
+
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five photographs of a field, one of nothing, and one file that is none."""
@@ -164,6 +173,7 @@ def test_flight_toml_takes_the_camera_with_its_covariance(
         read_camera_and_targets(tmp_path)
 
 
+@pytest.mark.usefixtures("_no_figures")
 def test_the_same_photographs_give_the_same_bytes(
     photos: Path, calibration: tuple[Path, Result], tmp_path: Path
 ) -> None:
@@ -174,6 +184,7 @@ def test_the_same_photographs_give_the_same_bytes(
     assert not list(tmp_path.glob(".*"))  # no journal is left
 
 
+@pytest.mark.usefixtures("_no_figures")
 def test_a_format_with_one_focal_length_does_not_force_it_on_the_camera(tmp_path: Path) -> None:
     folder, out = tmp_path / "photos", tmp_path / "out"
     folder.mkdir()
@@ -197,6 +208,7 @@ def test_a_format_with_one_focal_length_does_not_force_it_on_the_camera(tmp_path
     assert camera.fy == pytest.approx(370.0, abs=2.0)
 
 
+@pytest.mark.usefixtures("_no_figures")
 def test_cameras_of_an_earlier_run_are_named(photos: Path, tmp_path: Path) -> None:
     (tmp_path / "opencv.yml").write_text("older")
     options = ("--jobs", "0", "--response", "linear", "--operator", "centroid", "--format", "ros")
@@ -206,6 +218,7 @@ def test_cameras_of_an_earlier_run_are_named(photos: Path, tmp_path: Path) -> No
     assert "left as an earlier calibration wrote them: opencv" in result.stderr
 
 
+@pytest.mark.usefixtures("_no_figures")
 def test_the_field_may_be_free_and_the_lens_chosen(photos: Path, tmp_path: Path) -> None:
     chosen = ("--points", "free", "--model", "radial", "--operator", "centroid")
     field = photos / "field.toml"
@@ -394,6 +407,7 @@ def test_results_that_cannot_be_written_cost_no_measurements(
     assert not list(tmp_path.glob(".*"))
 
 
+@pytest.mark.usefixtures("_no_figures")
 def test_photographs_of_another_size_are_left_out(photos: Path, tmp_path: Path) -> None:
     folder = tmp_path / "photos"
     shutil.copytree(photos, folder)
