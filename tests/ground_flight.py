@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,6 +29,12 @@ _CODES = ([0, 43, 78, 180], [0, 60, 150, 270], [0, 35, 120, 200], [0, 80, 125, 2
 _NULL_ROW: dict[str, object] = {column.name: None for column in DETECTION_COLUMNS}
 
 
+@functools.cache
+def local_frame() -> LocalFrame:
+    """The frame of all these flights: to look up its CRS takes longer than to plan a flight."""
+    return LocalFrame.at(CRS, ORIGIN_MAP)
+
+
 @dataclass
 class GroundFlight:
     """Where everything is; `write` makes the folder."""
@@ -47,7 +54,7 @@ class GroundFlight:
     renamed: dict[tuple[int, str], str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.local_frame = LocalFrame.at(CRS, ORIGIN_MAP)
+        self.local_frame = local_frame()
         self.rng = np.random.default_rng(self.seed)
         self.positions_map = ORIGIN_MAP + self.offsets_m
         self.positions = self.local_frame.enu_from_map(self.positions_map)

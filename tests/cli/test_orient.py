@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -401,8 +402,13 @@ def test_options_that_do_not_go_together(
     assert message in result.stderr
 
 
-def field_flight(folder: Path) -> list[Pose]:
-    """A board in two frames, and one without; its file; the poses, field → camera."""
+@pytest.fixture(scope="module")
+def rendered_field(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Pose]]:
+    """A board in two frames, and one without; its file; the poses, field → camera.
+
+    Tests change copies of it.
+    """
+    folder = tmp_path_factory.mktemp("field") / "flight"
     camera = Camera(320, 240, 330.0, 330.0, 163.0, 117.5, -0.08, response=Response.LINEAR)
     board = Field(
         "board",
@@ -425,12 +431,19 @@ def field_flight(folder: Path) -> list[Pose]:
     lines += ["dot_diameter_m = 0.12", "code_deg = [0, 43, 78]"]
     (folder / "flight.toml").write_text("\n".join(lines), encoding="utf-8")
     (folder / "field.toml").write_text(field_toml(board), encoding="utf-8")
-    return poses
+    return folder, poses
 
 
-def test_a_field_orients_frames_in_its_own_frame(tmp_path: Path) -> None:
-    folder = tmp_path / "flight"
-    poses = field_flight(folder)
+@pytest.fixture
+def field_flight(rendered_field: tuple[Path, list[Pose]], tmp_path: Path) -> Path:
+    """A copy of the rendered flight over a board."""
+    return Path(shutil.copytree(rendered_field[0], tmp_path / "flight"))
+
+
+def test_a_field_orients_frames_in_its_own_frame(
+    field_flight: Path, rendered_field: tuple[Path, list[Pose]]
+) -> None:
+    folder, (_, poses) = field_flight, rendered_field
     result = run("orient", folder, "--field", folder / "field.toml", "--json")
     assert result.exit_code == 0, result.stderr
     summary = json.loads(result.stdout)
@@ -461,16 +474,14 @@ def test_a_field_orients_frames_in_its_own_frame(tmp_path: Path) -> None:
     ],
 )
 def test_a_field_whose_discs_have_another_size_than_stated_is_doubted(
-    tmp_path: Path, stated: str, words: str
+    field_flight: Path, stated: str, words: str
 ) -> None:
     """Distances that are right, in millimetres, and 10 % too short."""
-    folder = tmp_path / "flight"
-    field_flight(folder)
-    toml = folder / "field.toml"
+    toml = field_flight / "field.toml"
     text = toml.read_text(encoding="utf-8")
     assert "pitch_m = 0.03" in text
     toml.write_text(text.replace("pitch_m = 0.03", stated), encoding="utf-8")
-    result = run("orient", folder, "--field", toml, "--json")
+    result = run("orient", field_flight, "--field", toml, "--json")
     assert result.exit_code == 0, result.stderr
     doubts = json.loads(result.stdout)["doubts"]
     assert len(doubts) == (1 if words else 0)
@@ -478,10 +489,8 @@ def test_a_field_whose_discs_have_another_size_than_stated_is_doubted(
     assert words in result.stderr
 
 
-def test_a_field_without_a_mark_does_not_tell_how_it_lies(tmp_path: Path) -> None:
-    folder = tmp_path / "flight"
-    field_flight(folder)
-    result = run("orient", folder, "--field", "grid:5x4:30mm:16mm")
+def test_a_field_without_a_mark_does_not_tell_how_it_lies(field_flight: Path) -> None:
+    result = run("orient", field_flight, "--field", "grid:5x4:30mm:16mm")
     assert result.exit_code == 1
     assert "the field looks the same turned, and nothing tells how it lies" in result.stderr
 
