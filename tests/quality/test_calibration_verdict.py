@@ -276,9 +276,10 @@ def _about_middle() -> FloatArray:
     return np.asarray(flat - flat.mean(axis=0))
 
 
-def twelve_views() -> list[NamedView]:
+def nine_views() -> list[NamedView]:
+    """Of which a quarter are two; of six to eight, all pairs would be tried."""
     farther = [replace(view, photo=f"{view.photo}b") for view in views(distance_m=0.4)]
-    return views() + farther
+    return views() + farther[:3]
 
 
 def upside_down(view: NamedView) -> NamedView:
@@ -341,7 +342,7 @@ def test_a_photograph_without_any_kept_disc_is_the_worst() -> None:
 
 
 def test_photographs_whose_files_are_turned_by_half_a_turn_take_no_part() -> None:
-    made = twelve_views()
+    made = nine_views()
     made[2], made[7] = upside_down(made[2]), upside_down(made[7])
     result = calibrated(made, PointModel.STIFF, LensModel.AUTO)
     assert set(result.dropped) == {"p2", "p1b"}
