@@ -157,7 +157,7 @@ def test_a_ring_alone_is_as_sure_as_the_less_sure_of_both_says(
     assert off_m / np.sqrt(sight @ found.cov[:3, :3] @ sight) == pytest.approx(1.0, abs=0.1)
 
 
-@pytest.mark.parametrize(("frames", "flights"), [(5, 14), (9, 8)])
+@pytest.mark.parametrize(("frames", "flights"), [(5, 7), (9, 8)])
 def test_a_ring_alone_shares_the_errors_of_positions_with_all_frames(
     frames: int, flights: int
 ) -> None:
@@ -184,7 +184,8 @@ def test_a_ring_alone_shares_the_errors_of_positions_with_all_frames(
         odd = 0.5 * (turn - turn.T)
         error = [*(found.pose.centre_m - flight.centres[-1]), odd[2, 1], odd[0, 2], odd[1, 0]]
         z.append(np.array(error) / np.sqrt(np.diag(found.cov)))
-    assert 0.7 < float(np.sqrt(np.mean(np.square(z)))) < 1.25
+    # 95 % of 21 values: of the six errors of 7 flights, about three are independent
+    assert 0.7 < float(np.sqrt(np.mean(np.square(z)))) < 1.3
 
 
 def measured_ring(

@@ -118,7 +118,7 @@ def places_of(flight: GroundFlight, rng: np.random.Generator) -> dict[str, Targe
 def test_unknown_motion_is_in_the_deviations(targets: int) -> None:
     """Poses are those of the middle row; all targets agree and none is thought misplaced."""
     rng, z, off_px = np.random.default_rng(5), [], []
-    for seed in range(3):
+    for seed in range(2):
         flight = GroundFlight(NAMES[:targets], OFFSETS_M[:targets], frames=8, seed=seed)
         places = places_of(flight, rng)
         sightings = []
@@ -133,8 +133,8 @@ def test_unknown_motion_is_in_the_deviations(targets: int) -> None:
             assert found.residuals is not None
             off_px.append(np.abs(found.residuals[:, :2]).max())
         assert wrong_position(poses, sightings, places, CAMERA, UNSTATED_SCALE_SD) is None
-    assert len(z) >= 22  # of six errors, of which about three are independent
-    assert 0.75 < float(np.sqrt(np.mean(np.square(z)))) < 1.25
+    assert len(z) >= 14  # of six errors, of which about three are independent
+    assert 0.74 < float(np.sqrt(np.mean(np.square(z)))) < 1.27  # 99 % of 48 values
     assert float(np.max(off_px)) < 1.0  # three pixels without the motion
 
 

@@ -109,19 +109,20 @@ def test_errors_of_small_rings_behind_other_spreads_are_as_large_as_reported(
     errors_of: Callable[..., Errors], optics: Optics
 ) -> None:
     """Residuals show skew or kurtosis, but too little to make them free: 2.0 and 1.9 without."""
-    errors = errors_of(LENS, 9.5, 32, optics=optics)
-    assert 0.6 < rms(errors.distance_sigmas) < 1.4
-    assert 0.6 < rms(errors.centre_sigmas) < 1.4
+    errors = errors_of(LENS, 9.5, 16, optics=optics)
+    assert 0.57 < rms(errors.distance_sigmas) < 1.46  # 99 % of 16 values
+    assert 0.69 < rms(errors.centre_sigmas) < 1.33  # 99 % of 32
 
 
 @pytest.mark.parametrize(("radius_px", "percent"), [(12.0, 0.06), (24.0, 0.02)])
 def test_errors_are_as_large_as_reported(
     errors_of: Callable[..., Errors], radius_px: float, percent: float
 ) -> None:
-    errors = errors_of(LENS, radius_px, 24)
-    assert 0.6 < rms(errors.distance_sigmas) < 1.4
-    assert 0.6 < rms(errors.centre_sigmas) < 1.4
-    assert 3.2 < np.median(errors.pose_chi2) < 8.0  # of χ² with 6 degrees of freedom: 5.3
+    errors = errors_of(LENS, radius_px, 16)
+    assert 0.57 < rms(errors.distance_sigmas) < 1.46  # 99 % of 16 values
+    assert 0.69 < rms(errors.centre_sigmas) < 1.33  # 99 % of 32
+    # of χ² with 6 degrees of freedom: 5.3, and of 16 values 3.2 to 8.3 in 99 %
+    assert 3.2 < np.median(errors.pose_chi2) < 8.3
     assert errors.pose_chi2.max() < 30.0
     assert 0.2 * percent < rms(errors.distance_percent) < percent
 
@@ -273,15 +274,15 @@ def test_compression_displaces_no_edges_of_a_stated_curve(
 ) -> None:
     """What it leaves of an edge is not quite sRGB's: rings were 0.0055 px too large, by 1.5 σ."""
     camera, sigmas = replace(LENS, response=Response.SRGB), []
-    for seed in range(16):
+    for seed in range(8):
         rng = np.random.default_rng(seed)
         pose = random_pose(camera, 50.0, rng)
         grey = photograph(camera, pose, rng, sensor=Sensor(tone=ToneCurve.SRGB), gain=0.7)
         start = start_near(camera, pose, rng)
         seen = measure_by_model(compressed(grey, 75), camera, TARGET, start)
         sigmas.append(standardised(camera, seen, pose)[1])
-    assert -0.7 < np.mean(sigmas) < 0.7
-    assert 0.5 < rms(np.array(sigmas)) < 1.4
+    assert -0.9 < np.mean(sigmas) < 0.9  # 99 % of the means of 8 values
+    assert 0.41 < rms(np.array(sigmas)) < 1.66  # and of their RMS
 
 
 def test_both_poses_are_reported_whichever_the_start(
