@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import image_heading_deg
-from kgcp.measurement.adjustment.covariance import propagate, spread_over_both
+from kgcp.measurement.adjustment.covariance import ambiguity_cov, propagate
 from kgcp.measurement.records import Alternative, Measurement
 
 
@@ -28,16 +28,16 @@ def with_preference(camera: Camera, measurement: Measurement, preference: float)
     if other.pose_cov is None or measurement.uncertainty is None:
         return replace(measurement, alternative=replace(other, ambiguity=max(ambiguity, 0.0)))
     own_cov = measurement.uncertainty.pose_cov.copy()
-    own_cov[:3, :3] -= spread_over_both(measurement.pose, other.pose, other.ambiguity)
+    own_cov[:3, :3] -= ambiguity_cov(measurement.pose, other.pose, other.ambiguity)
     if ambiguity >= 0.0:
-        own_cov[:3, :3] += spread_over_both(measurement.pose, other.pose, ambiguity)
+        own_cov[:3, :3] += ambiguity_cov(measurement.pose, other.pose, ambiguity)
         return replace(
             measurement,
             alternative=replace(other, ambiguity=ambiguity),
             uncertainty=propagate(camera, measurement.pose, own_cov),
         )
     pose_cov = other.pose_cov.copy()
-    pose_cov[:3, :3] += spread_over_both(other.pose, measurement.pose, -ambiguity)
+    pose_cov[:3, :3] += ambiguity_cov(other.pose, measurement.pose, -ambiguity)
     return replace(
         measurement,
         pose=other.pose,

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.georef.neighbouring_normals import preferences_of_neighbours
-from kgcp.measurement.adjustment.covariance import propagate, spread_over_both
+from kgcp.measurement.adjustment.covariance import ambiguity_cov, propagate
 from kgcp.measurement.other_pose import with_preference
 from kgcp.measurement.records import (
     Alternative,
@@ -97,7 +97,7 @@ def plate_of_two_places(ambiguity: float) -> Measurement:
     apart_m = np.array([0.05, 0.0, 0.1])
     other = Pose(seen.pose.mirrored().rotation, seen.pose.translation_m + apart_m)
     pose_cov = COV.copy()
-    pose_cov[:3, :3] += spread_over_both(seen.pose, other, ambiguity)
+    pose_cov[:3, :3] += ambiguity_cov(seen.pose, other, ambiguity)
     return replace(
         seen,
         alternative=Alternative(other, ambiguity, OTHER_COV),

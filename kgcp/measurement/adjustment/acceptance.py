@@ -1,4 +1,4 @@
-"""Is it really this target? What a fit must show before it is reported."""
+"""Acceptance tests: what a fit must show before it is reported as this target."""
 
 from __future__ import annotations
 
@@ -19,20 +19,23 @@ from kgcp.targets.layout import Ring
 
 _MAX_OUTLIERS = 0.3
 _MAX_EDGE_NOISE = 0.15  # of the contrast: the largest residuals near edges
-_NO_SENSE = 2.0
+_UNDEFINED_EDGE_NOISE = 2.0  # where residuals or contrast are missing: above any limit
 _MAX_RELATIVE_SD, _MAX_RELATIVE_SD_OF_SMALL = 0.01, 0.02
 _POSITIONS = 72  # around the code circle
-_MIN_PIXELS = 3
-_EXTRA, _LACK = 0.45, 0.6  # of a dot's contrast: another dot, or the lack of one
-_MOVED = 0.2  # of a dot's contrast: so much more light on one side of a dot and less on the other
-_DOTS_PER_MISSING = 4  # one dot in so many may be dirty
+_MIN_PIXELS = 3  # to tell the light at a position
+# Residual light at a position, in units of a whole dot's: above the first, a dot is there that the
+# code does not have; below minus the second, a dot of the code is missing.
+_EXTRA_DOT, _MISSING_DOT = 0.45, 0.6
+# A dot is moved if one side of it has so much more light and the other side so much less.
+_MOVED_DOT = 0.2
+_DOTS_PER_MISSING = 4  # one dot in so many may be missing, hidden by dirt
 
 
 def edge_noise(fit: TargetFit) -> float:
-    """Return the residuals near edges, of the contrast; above 1 where nothing makes sense."""
+    """Return the median residual near edges as a share of the contrast; 2 if it is undefined."""
     black, white = plateau_levels(fit.parameters.light, fit.sample.problem.tone)
     residual = median_at_edges(fit.sd, fit.prediction.share, 0.2, 0.8, math.nan)
-    return residual / (white - black) if residual > 0.0 and white > black else _NO_SENSE
+    return residual / (white - black) if residual > 0.0 and white > black else _UNDEFINED_EDGE_NOISE
 
 
 def check_fit(fit: TargetFit) -> None:
@@ -54,8 +57,8 @@ def check_fit(fit: TargetFit) -> None:
 def check_precision(observation: Measurement) -> None:
     """Refuse a measurement so uncertain that it can hardly be of this target.
 
-    Even far, blurred and badly exposed targets are measured to some parts in a thousand; clutter
-    that happens to be round and dotted leaves residuals that say otherwise.
+    Even far, blurred and badly exposed targets are measured to some parts in a thousand. Clutter
+    that happens to be round and dotted leaves large residuals, and with them large deviations.
 
     Raises
     ------
@@ -64,16 +67,17 @@ def check_precision(observation: Measurement) -> None:
     """
     if observation.uncertainty is None:
         return
-    share = observation.uncertainty.sd_distance_m / observation.pose.distance_m
+    relative_sd = observation.uncertainty.sd_distance_m / observation.pose.distance_m
     is_small = observation.appearance.radius_px < SMALL_RING_PX
-    if share > (_MAX_RELATIVE_SD_OF_SMALL if is_small else _MAX_RELATIVE_SD):
-        raise Rejection(Reason.POOR_FIT, f"distance uncertain by {share:.1%}")
+    if relative_sd > (_MAX_RELATIVE_SD_OF_SMALL if is_small else _MAX_RELATIVE_SD):
+        raise Rejection(Reason.POOR_FIT, f"distance uncertain by {relative_sd:.1%}")
 
 
 def check_code(fit: TargetFit) -> None:
-    """Refuse a ring that shows a dot where this code has none, or lacks more than a dirty one.
+    """Refuse a ring with an extra dot, a moved dot, or too many missing dots.
 
     The residuals of the fit are averaged over discs of a dot's size all around the code circle.
+    Up to one missing dot in four is accepted: dirt may hide it.
 
     Raises
     ------
@@ -81,21 +85,32 @@ def check_code(fit: TargetFit) -> None:
         `OTHER_CODE`.
     """
     ring = fit.sample.problem.ring
-    excess = _light_around_code_circle(fit, ring)
-    at_dot, between, sides = _places_of_code(ring)
+    excess = _excess_light_around_code_circle(fit, ring)
+    at_dot, between, sides = _positions_by_code(ring)
     extra = float(excess[between].max(initial=0.0))
-    missing = int(np.count_nonzero(excess[at_dot] < -_LACK))
+    missing = int(np.count_nonzero(excess[at_dot] < -_MISSING_DOT))
     moved = _largest_displacement(excess, sides)
-    if extra > _EXTRA or missing > len(ring.code_deg) // _DOTS_PER_MISSING or moved > _MOVED:
+    if (
+        extra > _EXTRA_DOT
+        or missing > len(ring.code_deg) // _DOTS_PER_MISSING
+        or moved > _MOVED_DOT
+    ):
         light = f"{extra:.0%} of a dot's light elsewhere, {moved:.0%} beside its place"
         raise Rejection(Reason.OTHER_CODE, f"{missing} dots missing, {light}")
 
 
 @cache
-def _places_of_code(ring: Ring) -> tuple[IndexArray, BoolArray, BoolArray]:
-    """Return, of the positions, those of the dots (d,), which are clear of dots, and their sides.
+def _positions_by_code(ring: Ring) -> tuple[IndexArray, BoolArray, BoolArray]:
+    """Relate the 72 positions on the code circle to the d dots of a code.
 
-    The positions (72, d) beside each dot before it, and after it.
+    Returns
+    -------
+    at_dot : (d,) array of int
+        Position nearest to each dot.
+    between : (72,) array of bool
+        Positions clear of all dots.
+    sides : (2, 72, d) array of bool
+        Positions just before, and just after, each dot.
     """
     angles_deg = np.arange(_POSITIONS) * (360.0 / _POSITIONS)
     off_dot_deg = (angles_deg[:, None] - np.array(ring.code_deg) + 180.0) % 360.0 - 180.0
@@ -109,23 +124,23 @@ def _places_of_code(ring: Ring) -> tuple[IndexArray, BoolArray, BoolArray]:
 
 def _largest_displacement(excess: FloatArray, sides: BoolArray) -> float:
     """Return the light that is too much on one side of a dot and too little on the other."""
-    known = excess[:, None] * sides
-    most, lack = known.max(axis=1), -known.min(axis=1)
-    return float(np.minimum(most, lack[::-1]).max())
+    beside = excess[:, None] * sides
+    surplus, deficit = beside.max(axis=1), -beside.min(axis=1)
+    return float(np.minimum(surplus, deficit[::-1]).max())
 
 
-def _light_around_code_circle(fit: TargetFit, ring: Ring) -> FloatArray:
-    """Return what the fit lacks of light all around the code circle, 1: a whole dot.
+def _excess_light_around_code_circle(fit: TargetFit, ring: Ring) -> FloatArray:
+    """Return the light (72,) beyond the fit, all around the code circle; 1 is a whole dot's.
 
-    0, which says nothing, where too few pixels are seen.
+    It is 0, which says nothing, where too few pixels are seen.
     """
     sample, clip = fit.sample, fit.sample.censoring.high
     black, white = plateau_levels(fit.parameters.light, sample.problem.tone)
-    lack = sample.levels - np.minimum(fit.prediction.levels, clip)
-    lack = lack / max(min(white, clip) - black, sample.problem.window.levels_per_count)
+    excess = sample.levels - np.minimum(fit.prediction.levels, clip)
+    excess = excess / max(min(white, clip) - black, sample.problem.window.levels_per_count)
     code_m, dot_m = 0.5 * ring.code_diameter_m, 0.5 * ring.dot_diameter_m
     counts, sums = np.zeros(_POSITIONS), np.zeros(_POSITIONS)
-    _gather_around(fit.prediction.points_m, lack, code_m, dot_m, counts, sums)
+    _gather_around(fit.prediction.points_m, excess, code_m, dot_m, counts, sums)
     px_per_m = sample.problem.outer_radius_px / sample.problem.outer_radius_m
     ratio = dot_m * px_per_m / fit.parameters.blur.mean_sd_px
     visible = 0.85 * (1.0 - math.exp(-0.5 * ratio * ratio))  # of a dot's light after the blur
@@ -135,13 +150,13 @@ def _light_around_code_circle(fit: TargetFit, ring: Ring) -> FloatArray:
 @compiled
 def _gather_around(
     points_m: FloatArray,
-    lack: FloatArray,
+    excess: FloatArray,
     code_m: float,
     dot_m: float,
     counts: FloatArray,
     sums: FloatArray,
 ) -> None:
-    """Count the pixels within discs on the code circle, and add up what they lack."""
+    """Count the pixels within discs on the code circle, and add up their excess light."""
     step = 2.0 * math.pi / len(counts)
     reach = math.ceil(math.asin(min(1.0, dot_m / code_m)) / step)
     angles = np.arange(len(counts)) * step
@@ -156,4 +171,4 @@ def _gather_around(
             dx, dy = x - centres_x[k], y - centres_y[k]
             if dx * dx + dy * dy < dot_m * dot_m:
                 counts[k] += 1.0
-                sums[k] += lack[i]
+                sums[k] += excess[i]

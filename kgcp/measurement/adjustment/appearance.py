@@ -24,11 +24,11 @@ from kgcp.measurement.records import Appearance, Imaging, ToneBase
 from kgcp.targets.layout import Target
 
 TONE_OF_BASE = {ToneBase.SRGB: Tone.UNKNOWN, ToneBase.LINE: Tone.UNKNOWN_FROM_LINE}
-"""The tone of a fit, by the base that it departs from."""
+"""The tone of a fit, by the base of its tone curve."""
 _BASE_OF_TONE = {tone: base for base, tone in TONE_OF_BASE.items()}
-_NEAR_EDGE = 0.3  # of the white share, from a half
-_LEAST_SHARE, _LEAST_CONTRAST = 1e-3, 0.05
-_LIGHTS = 400  # of which the grey value is computed
+_NEAR_EDGE = 0.3  # pixels near an edge have a white share of 0.5 ± this
+_LEAST_SHARE, _LEAST_CONTRAST = 1e-3, 0.05  # keep places and quotients finite
+_CURVE_POINTS = 400  # at which the tone curve is tabulated
 
 
 def appearance_of(camera: Camera, target: Target, fit: TargetFit) -> Appearance:
@@ -54,19 +54,23 @@ def appearance_of(camera: Camera, target: Target, fit: TargetFit) -> Appearance:
 
 
 def _edge_shift_px(fit: TargetFit) -> float:
-    """Return how far a straight edge seems displaced towards the dark side, in the mean.
+    """Return the mean displacement of a straight edge towards the dark side.
 
     The apparent edge is where the grey value passes midway between the plateaus as they are seen,
-    clipped; the true one is where half the light comes from either side.
+    clipped. The true edge is where half the light comes from either side.
     """
     return -float(np.mean(places_across_edges_px(fit, None)))
 
 
 def places_across_edges_px(fit: TargetFit, level: float | None) -> FloatArray:
-    """Return how far from a straight edge, towards white, a grey value is reached (n,) [px].
+    """Return where across a straight edge a grey value is reached (n,) [px], towards white.
 
-    None is the one midway between both sides of the edge as they are seen, clipped. In even light
-    there is one place; otherwise there is one for every pixel near an edge.
+    In even light there is one place (n = 1), otherwise one for every pixel near an edge.
+
+    Parameters
+    ----------
+    level : float or None
+        Grey value; None: midway between both sides of the edge as they are seen, clipped.
     """
     light, problem, field = fit.parameters.light, fit.sample.problem, fit.parameters.field
     tone, high = problem.tone, problem.brightest
@@ -78,7 +82,7 @@ def places_across_edges_px(fit: TargetFit, level: float | None) -> FloatArray:
         off = np.abs(fit.prediction.share - 0.5)
         near = off <= max(_NEAR_EDGE, float(off.min()))
         ink, plate = np.array([[0.0], [1.0]]) + field.added(fit.sample.pixels[:, near])
-        lights = np.linspace(float(ink.min()), float(plate.max()), _LIGHTS)
+        lights = np.linspace(float(ink.min()), float(plate.max()), _CURVE_POINTS)
         rising = np.maximum.accumulate(encoded(toned(lights, light.values), tone))
         dark, bright = (np.interp(side, lights, rising) for side in (ink, plate))
         midway = 0.5 * (dark + np.minimum(bright, high))
@@ -90,12 +94,12 @@ def places_across_edges_px(fit: TargetFit, level: float | None) -> FloatArray:
 
 
 def imaging_of(fit: TargetFit) -> Imaging | None:
-    """Return what a fit says of the camera; None if the camera's tone is known, or of bins."""
+    """Return what a fit says of the camera; None if the tone is known, or in bins."""
     problem, light = fit.sample.problem, fit.parameters.light
     if problem.tone not in _BASE_OF_TONE:
         return None
     noise = noise_of(fit.sample, fit.prediction)
-    ink, plate = (int(reach(fit.prediction.share)) for reach in (np.argmin, np.argmax))
+    ink, plate = (int(find(fit.prediction.share)) for find in (np.argmin, np.argmax))
     return Imaging(
         base=_BASE_OF_TONE[problem.tone],
         black=light.black,

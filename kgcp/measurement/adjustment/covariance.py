@@ -1,12 +1,14 @@
-"""Covariances that hold up: from the residuals as they are, correlation included.
+"""Covariance of a fitted pose, from residuals that may be correlated along edges.
 
-The inverse normal matrix is the covariance only if residuals are independent from pixel to pixel.
-Jagged print, JPEG, sharpening and the tails of unmodelled effects run along the contours. So the
-scores (derivatives of the log-likelihood) are summed over short arcs of every circle, and the
+The inverse normal matrix N⁻¹ is the covariance only if residuals are independent from pixel to
+pixel. Jagged print, JPEG, sharpening and unmodelled effects correlate them along the contours. So
+the scores (derivatives of the log-likelihood) are summed over short arcs of every circle, and the
 scatter of these sums gives the covariance of the gradient: a cluster-robust ("sandwich") estimate
-(Liang & Zeger, Biometrika 73, 1986; White, Econometrica 48, 1980). The fit makes that scatter
-smaller, the more so the fewer arcs there are: it is held against what independent residuals of
-this very fit would leave of it (Bell & McCaffrey, Survey Methodology 28, 2002).
+(Liang & Zeger, Biometrika 73, 1986; White, Econometrica 48, 1980).
+
+The fit itself makes that scatter smaller, the more so the fewer arcs there are. The scatter is
+therefore compared with the one that this fit would leave of independent residuals (Bell &
+McCaffrey, Survey Methodology 28, 2002).
 """
 
 from __future__ import annotations
@@ -44,40 +46,52 @@ from kgcp.measurement.image_model.rotation_displacement import mean_square_displ
 from kgcp.measurement.records import Uncertainty
 
 _ARC_PX = 6.0
-_UNEVEN_ARC_PX = 12.0  # where levels vary: stains leave residuals that go together over their knots
-_ARCS_IN_COMMON = 60.0  # what all directions scatter counts in each like so many arcs
-_ARCS_OF_NOISE = 20.0  # that residuals scatter less than noise counts against so many that do not
-_LEAST_LEFT = 0.25  # of the scatter, after the fit
-_VECTOR = 4  # numbers that the processor takes at once
-# Of a circle's edge as a whole: no print and no pixel is known better. That of bins is of the
-# frame's pixels: within bins, a tone curve displaces edges.
+# Where levels vary, arcs are longer: stains leave residuals that are correlated over the spacing of
+# the levels' knots.
+_UNEVEN_ARC_PX = 12.0
+# The ratio of the scatter to that of independent residuals is found in six directions of the pose,
+# from some twenty arcs on a small ring.
+_ARCS_OF_MEAN_RATIO = 60.0  # weight of the mean over all directions against each single ratio
+_ARCS_OF_UNIT_RATIO = 20.0  # weight of 1 against a mean that is below 1
+_LEAST_SCATTER_LEFT = 0.25  # share of the scatter that a fit leaves at least
+_SIMD_WIDTH = 4  # numbers that the processor takes at once
+# Least standard deviation of a displacement that a circle's whole edge has in common: no print and
+# no pixel is known better. In bins it is larger, since a tone curve displaces edges within a bin;
+# that value is in pixels of the frame.
 _EDGE_FLOOR_PX, _EDGE_FLOOR_OF_BINS_PX = 0.0005, 0.004
-# Where levels vary, they may stand in for halos of sharpening: sets of 23 to 40 rings of R ≥ 26 px
-# are too large or too small by up to 0.0015 px, at strengths of 0.5 to 0.8 (docs/method.md).
+# Levels that vary may imitate the halos of sharpening. Simulated sets of 23 to 40 rings of R ≥ 26
+# px, sharpened with strengths of 0.5 to 0.8, were too large or too small by up to 0.0015 px in the
+# mean (docs/method.md, "Covariance"). So this times the strength counts as such a displacement.
 _PER_SHARPENING_PX = 0.003
-# Variance on small rings, relative to what residuals show of uneven light: where levels vary; and
-# up to so much where they do not, as residuals do not say enough of them
-# (`benchmarks.accuracy.ring_sizes`, without these factors: z of 1.4 in shade and 1.5 with dirt).
-_ON_SMALL_RINGS, _ON_EVEN_SMALL_RINGS = 1.8, 1.4
-# Of what a skew spread displaces: beyond its third moment nothing is known. Of 139 plates behind
-# four comatic lenses, centres are off by 0.09 to 0.20 of it per axis (RMS), behind another
-# program's lens by 0.19. Levels that vary take part of a skew.
+# Factors of the variances on small rings, whose residuals do not show enough of uneven light: where
+# levels vary, and at most where they do not. Without them, z was 1.4 in shade and 1.5 with dirt
+# (`benchmarks.accuracy.ring_sizes`).
+_SMALL_RING_FACTOR, _MOST_EVEN_SMALL_RING_FACTOR = 1.8, 1.4
+# A skew point spread displaces edges by κ / 6σ² with its third cumulant κ, and by an unknown amount
+# with its higher moments. This share of κ / 6σ² counts as the standard deviation of that amount. Of
+# 139 simulated plates behind four comatic lenses, centres are off by 0.09 to 0.20 of it per axis
+# (RMS), behind another program's lens by 0.19. Levels that vary take up part of a skew: the share
+# is larger there.
 _SKEW_SHARE, _SKEW_SHARE_IN_UNEVEN_LIGHT = 0.18, 0.3
-# A bilateral filter hides a skew, but leaves its displacement. Residuals then agree along edges:
-# the share grows by as much as 1.1 while that inflates variances by 1.25 to 2.75. (Rings of R ≥ 26
-# px behind comatic lenses: 1.0 without such a filter, 2.3 and 3.9 with a weak and a strong one; in
-# another program's mixture 2.6 to 4.7.)
-_HIDDEN_SKEW_SHARE, _HIDES_SKEW = 1.1, (1.25, 2.75)
-# … and of what a kurtosis displaces. Out of focus by 2 and 3 px, without it, distances of rings of
-# R < 13 px have z of 1.0 to 2.0; with 0.2 instead, larger rings have 0.5 to 0.8.
+# A bilateral filter hides a skew from the fit, but not its displacement. Residuals then agree along
+# edges and inflate the variances: on rings of R ≥ 26 px behind comatic lenses 1.0 times without
+# such a filter, 2.3 times with a weak and 3.9 times with a strong one, in another program's mixture
+# 2.6 to 4.7 times. So the share above grows with the inflation: by nothing at 1.25, by 1.1 at 2.75.
+_HIDDEN_SKEW_SHARE, _INFLATION_BY_HIDDEN_SKEW = 1.1, (1.25, 2.75)
+# The share of what a kurtosis displaces that counts as a standard deviation, likewise. Without it,
+# distances of rings of R < 13 px have z of 1.0 to 2.0 out of focus by 2 and 3 px. With 0.2 instead,
+# larger rings have z of 0.5 to 0.8.
 _KURTOSIS_SHARE = 0.12
-# … and where edges scatter more than noise makes them, so much of that scatter. It counts only as
-# far as neighbouring residuals agree: in full where arcs scatter 1 + this times as much as
-# independent pixels would make them. The long arcs of large rings whose levels vary show all of it:
-# counted again, it made deviations of another program's phone and mixture 1.2 and 1.3 times as
-# large. Smaller rings have too few arcs for that.
-_COMMON_SHARE, _ALL_ALONG_ARCS, _MANY_UNEVEN_ARCS_PX = 0.25, 0.5, 32.0
-_EXTRAPOLATED_SHARE = 0.025  # … and so much of how far they are beyond what is not clipped
+# The share of the scatter of edges beyond the noise of the plateaus that a whole edge may have in
+# common. It counts as far as neighbouring residuals agree: in full where arcs scatter 1 + 0.5 times
+# as much as independent pixels, not at all where they scatter no more. From the radius on that
+# comes third, rings whose levels vary have long arcs enough to show all of it. Counted again there,
+# it made deviations of another program's phone and mixture 1.2 and 1.3 times as large. Smaller
+# rings have too few arcs for that.
+_COMMON_SHARE, _EXCESS_FOR_FULL_SHARE, _LARGE_UNEVEN_RING_PX = 0.25, 0.5, 32.0
+# Where the middle of an edge is clipped, its place is extrapolated from the part that is not: this
+# share of the distance to it counts as a standard deviation.
+_EXTRAPOLATED_SHARE = 0.025
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,13 +106,14 @@ class PoseCovariance:
 def pose_covariance(fit: TargetFit) -> PoseCovariance:
     """Return the covariance of the pose of a fit.
 
-    From the scatter of its scores over arcs, plus what a small common displacement of each circle's
-    edge would do.
+    It is found from the scatter of the scores over arcs. Added is what the scatter does not show: a
+    displacement that a circle's whole edge has in common, point spreads whose shape is not known
+    well, and an unknown rotation during the readout.
 
     Raises
     ------
     Rejection
-        `POOR_FIT`, if the pixels leave something open.
+        `POOR_FIT` if the pixels do not determine the pose.
     """
     misfit = fit.misfit
     if fit.level_equations is None:
@@ -114,56 +129,63 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
         raise Rejection(Reason.POOR_FIT, "the pixels do not determine the pose") from error
     circle, arc = _nearest_edges(fit)
     to_pose = np.linalg.solve(root, inverse[:6])  # in units of N⁻¹
-    by_pixel = np.zeros((scaled.shape[1], -(-len(scaled) // _VECTOR) * _VECTOR))
+    by_pixel = np.zeros((scaled.shape[1], -(-len(scaled) // _SIMD_WIDTH) * _SIMD_WIDTH))
     by_pixel[:, : len(scaled)] = scaled.T
     of_pose = by_pixel[:, : len(scaled)] @ to_pose.T
     sums, products, arcs = sums_over_arcs(of_pose, by_pixel, misfit.score, misfit.weight, arc)
     products = products[:, :, : len(scaled)]
-    # of an arc whose normal matrix is A, a fit to independent residuals leaves A − A N⁻¹ A
-    left = np.sum(products.sum(axis=0) * to_pose) - np.sum((products @ inverse) * products)
+    # of the scatter of independent residuals on an arc, its normal matrix A, a fit leaves
+    # A − A N⁻¹ A
+    scatter_left = np.sum(products.sum(axis=0) * to_pose) - np.sum((products @ inverse) * products)
     if fit.level_equations is not None:
-        left -= fit.level_equations.scatter_taken_over(of_pose, misfit.weight, arc)
-    ratios, directions = np.linalg.eigh(sums.T @ sums / max(left / 6.0, _LEAST_LEFT))
-    mean = float(ratios.mean())
-    if mean < 1.0:  # few arcs can agree by chance
-        mean = (arcs * mean + _ARCS_OF_NOISE) / (arcs + _ARCS_OF_NOISE)
-    ratios = (arcs * ratios + _ARCS_IN_COMMON * mean) / (arcs + _ARCS_IN_COMMON)
+        scatter_left -= fit.level_equations.scatter_taken_over(of_pose, misfit.weight, arc)
+    ratios, directions = np.linalg.eigh(
+        sums.T @ sums / max(scatter_left / 6.0, _LEAST_SCATTER_LEFT)
+    )
+    mean_ratio = float(ratios.mean())
+    if mean_ratio < 1.0:  # the scatter of few arcs may be small by chance
+        mean_ratio = (arcs * mean_ratio + _ARCS_OF_UNIT_RATIO) / (arcs + _ARCS_OF_UNIT_RATIO)
+    ratios = (arcs * ratios + _ARCS_OF_MEAN_RATIO * mean_ratio) / (arcs + _ARCS_OF_MEAN_RATIO)
     half = root @ (directions * np.sqrt(ratios))
-    in_common_px = common_displacement_px(fit, min(max(mean - 1.0, 0.0) / _ALL_ALONG_ARCS, 1.0))
-    shifts = inverse[:6] @ _edge_pull(fit, scaled, circle) * in_common_px
+    in_common_px = common_displacement_px(
+        fit, min(max(mean_ratio - 1.0, 0.0) / _EXCESS_FOR_FULL_SHARE, 1.0)
+    )
+    shifts = inverse[:6] @ _gradient_by_growth(fit, scaled, circle) * in_common_px
     pose_cov = half @ half.T + shifts @ shifts.T
-    pose_cov *= unevenness_factor(fit, mean)
+    pose_cov *= unevenness_factor(fit, mean_ratio)
     if fit.parameters.has_skew:
         depth_m = fit.parameters.matrix[2, 3]
-        across_px = _skew_displacement_px(fit, mean * np.diag(inverse), mean)
+        across_px = _skew_displacement_px(fit, mean_ratio * np.diag(inverse), mean_ratio)
         across_m = across_px * depth_m / fit.sample.problem.focal_px
         pose_cov[[0, 1], [0, 1]] += across_m * across_m
     if fit.parameters.has_kurtosis:
-        shift = _shift_by_kurtosis(fit, inverse, mean)
+        shift = _kurtosis_displacement(fit, inverse, mean_ratio)
         pose_cov += np.outer(shift, shift)
     is_small = fit.sample.problem.is_ring_small
     if is_small and not fit.unknowns.has_shape and fit.level_equations is None:
-        pose_cov += _by_shape_left_out(equations_by_shape(fit, scaled, normal), max(1.0, mean))
+        pose_cov += _omitted_shape_cov(
+            equations_by_shape(fit, scaled, normal), max(1.0, mean_ratio)
+        )
     shutter = fit.sample.problem.shutter
     if shutter is not None:
-        pose_cov += _by_unknown_rotation(fit, shutter)
-    return PoseCovariance(pose_cov, max(1.0, mean))
+        pose_cov += _unknown_rotation_cov(fit, shutter)
+    return PoseCovariance(pose_cov, max(1.0, mean_ratio))
 
 
 def unevenness_factor(fit: TargetFit, inflation: float) -> float:
-    """Return how many times the variances that residuals show are too small in uneven light.
+    """Return the factor by which variances are larger in uneven light than residuals show.
 
-    Only those of small rings are. If levels do not vary there, an `inflation` beyond 1 says that
-    the light may be uneven.
+    It is 1 unless the ring is small. On a small ring whose levels do not vary, an `inflation` above
+    1 says that the light may be uneven, and the factor grows with it.
     """
     if not fit.sample.problem.is_ring_small:
         return 1.0
     if fit.parameters.field is not None:
-        return _ON_SMALL_RINGS
-    return float(_ON_EVEN_SMALL_RINGS ** min(max(inflation - 1.0, 0.0), 1.0))
+        return _SMALL_RING_FACTOR
+    return float(_MOST_EVEN_SMALL_RING_FACTOR ** min(max(inflation - 1.0, 0.0), 1.0))
 
 
-def _by_unknown_rotation(fit: TargetFit, shutter: RollingShutter) -> FloatArray:
+def _unknown_rotation_cov(fit: TargetFit, shutter: RollingShutter) -> FloatArray:
     """Return what the scene's rotation during the readout adds to the covariance (6, 6)."""
     problem = fit.sample.problem
     return mean_square_displacement(
@@ -175,27 +197,31 @@ def _by_unknown_rotation(fit: TargetFit, shutter: RollingShutter) -> FloatArray:
 
 
 def _skew_displacement_px(fit: TargetFit, variances: FloatArray, inflation: float) -> float:
-    """Return the standard deviation of the centre by what skew spreads displace it [px].
+    """Return the standard deviation of the centre that a skew point spread adds [px].
 
-    A third cumulant κ displaces all edges across it by κ / 6σ². Higher moments of the spread are
-    not known, so that holds but for about a fifth of it, or a third in uneven light. Where an
-    `inflation` says that edges were processed, the κ that is seen may be a part of the lens's. What
-    of a κ may be noise, by the `variances` of the free parameters, is in the covariance already.
+    A third cumulant κ displaces all edges across it by κ / 6σ². Higher moments of the point spread
+    displace them, too, but are not known: that leaves about a fifth of κ / 6σ² uncertain, or a
+    third in uneven light. Where the `inflation` says that edges were processed, the fitted κ may be
+    only a part of the lens's.
+
+    The covariance of the fit already covers the part of κ that may be noise. It is taken off, by
+    the `variances` of the free parameters.
     """
     blur = fit.parameters.blur
     skew = np.array(blur.skew)
-    of_skew = variances[np.searchsorted(fit.unknowns.free, SKEW_PARAMS)]
-    largest = math.sqrt(max(0.0, float(np.max(skew * skew - of_skew))))
-    hidden = float(np.interp(inflation, _HIDES_SKEW, (0.0, _HIDDEN_SKEW_SHARE)))
+    skew_variances = variances[np.searchsorted(fit.unknowns.free, SKEW_PARAMS)]
+    largest = math.sqrt(max(0.0, float(np.max(skew * skew - skew_variances))))
+    hidden = float(np.interp(inflation, _INFLATION_BY_HIDDEN_SKEW, (0.0, _HIDDEN_SKEW_SHARE)))
     share = _SKEW_SHARE if fit.level_equations is None else _SKEW_SHARE_IN_UNEVEN_LIGHT
     return (share + hidden) * largest / (6.0 * blur.mean_sd_px**2)
 
 
-def _shift_by_kurtosis(fit: TargetFit, inverse: FloatArray, inflation: float) -> FloatArray:
-    """Return the deviation of the pose (6,) by what a spread's kurtosis displaces it.
+def _kurtosis_displacement(fit: TargetFit, inverse: FloatArray, inflation: float) -> FloatArray:
+    """Return the displacement of the pose (6,) that a point spread's kurtosis leaves uncertain.
 
-    It is that of a fit without kurtosis. What of a kurtosis may be noise, by the `inverse` normal
-    matrix, is in the covariance already.
+    It is a share of the one that a fit without kurtosis would have. The covariance of the fit
+    already covers the part of the kurtosis that may be noise. It is taken off, by the `inverse`
+    normal matrix.
     """
     k = int(np.searchsorted(fit.unknowns.free, Param.KURTOSIS))
     beyond_noise = fit.parameters.blur.kurtosis**2 - inflation * inverse[k, k]
@@ -203,14 +229,16 @@ def _shift_by_kurtosis(fit: TargetFit, inverse: FloatArray, inflation: float) ->
     return np.asarray(size * inverse[:6, k] / inverse[k, k])
 
 
-def _by_shape_left_out(by_shape: ShapeEquations, inflation: float) -> FloatArray:
+def _omitted_shape_cov(by_shape: ShapeEquations, inflation: float) -> FloatArray:
     """Return what skew and kurtosis of the point spread, left at 0, add to the covariance (6, 6).
 
-    Residuals of small rings mostly show too little of them to make them free. What they show, one
-    step of Newton's method, displaces the pose, which counts as a deviation as far as χ² is beyond
-    what noise alone makes of it. By 40 rings of R 7 to 13 px behind each of several comatic lenses,
-    the centre's z was 1.9 to 2.2 and is 0.9 to 1.1; out of focus by 1.5 px, the distance's was 1.3
-    and is 1.0. Behind Gaussian spreads both stay as they are.
+    Residuals of small rings mostly show too little of the two to make them free. One step of
+    Newton's method tells how large they seem, and how far that would displace the pose. The
+    displacement counts as a deviation as far as their χ² exceeds that of noise alone.
+
+    In simulations of 40 rings of R 7 to 13 px each, behind several comatic lenses, z of the centre
+    was 1.9 to 2.2 without this and is 0.9 to 1.1. Out of focus by 1.5 px, z of the distance was 1.3
+    and is 1.0. Behind Gaussian point spreads both stay as they are.
     """
     cov = np.linalg.inv(by_shape.normal + np.diag(SHAPE_PRECISIONS))
     seen = cov @ by_shape.score
@@ -226,10 +254,13 @@ def _by_shape_left_out(by_shape: ShapeEquations, inflation: float) -> FloatArray
 def common_displacement_px(fit: TargetFit, share_along_arcs: float) -> float:
     """Return the standard deviation of the displacement that all of a circle's edge shares [px].
 
-    From the residuals: what edges scatter beyond the noise of the plateaus averages out along a
-    circle only in part where it goes together along arcs (coarse sampling of a print, tails of what
-    is not modelled), and wholly where it does not (compression). And of an edge whose middle is
-    clipped only a tail is seen, whose shape is not known exactly.
+    Edges may scatter more than the noise of the plateaus. Where that scatter is correlated along
+    arcs (coarse sampling of a print, effects that are not modelled), it averages out along a circle
+    only in part; where it is not (compression), it averages out wholly. `share_along_arcs` says how
+    far it is, 0…1.
+
+    Of an edge whose middle is clipped only a tail is seen, whose shape is not known exactly: that
+    counts, too.
     """
     problem, light = fit.sample.problem, fit.parameters.light
     is_even = fit.level_equations is None
@@ -238,7 +269,7 @@ def common_displacement_px(fit: TargetFit, share_along_arcs: float) -> float:
     else:
         floor_px = _EDGE_FLOOR_PX if is_even else _halo_displacement_px(light)
     floor_px = math.hypot(floor_px, _EXTRAPOLATED_SHARE * _clipped_reach_px(fit))
-    if not is_even and problem.outer_radius_px >= _MANY_UNEVEN_ARCS_PX:
+    if not is_even and problem.outer_radius_px >= _LARGE_UNEVEN_RING_PX:
         return floor_px
     noise = noise_of(fit.sample, fit.prediction, is_even=is_even)
     excess = np.maximum(noise.sd**2 - noise.plateau_sd**2, 0.0)
@@ -250,31 +281,31 @@ def common_displacement_px(fit: TargetFit, share_along_arcs: float) -> float:
 
 
 def _halo_displacement_px(light: Light) -> float:
-    """Return the standard deviation of edges where levels stand in for halos of sharpening [px]."""
+    """Return the standard deviation of edges where levels may imitate sharpening's halos [px]."""
     strength = light.sharpening + light.linear_sharpening
     return math.hypot(_EDGE_FLOOR_PX, _PER_SHARPENING_PX * strength)
 
 
 def _clipped_reach_px(fit: TargetFit) -> float:
-    """Return how far the middle of a straight edge is within what is clipped, in the mean [px]."""
+    """Return how far the middle of a straight edge lies in the clipped part, in the mean [px]."""
     limits = fit.sample.problem.censoring
-    burnt = places_across_edges_px(fit, limits.high)
-    sunk = places_across_edges_px(fit, limits.low)
-    return float(np.mean(np.maximum(0.0, np.maximum(-burnt, sunk))))
+    high_px = places_across_edges_px(fit, limits.high)
+    low_px = places_across_edges_px(fit, limits.low)
+    return float(np.mean(np.maximum(0.0, np.maximum(-high_px, low_px))))
 
 
-def _edge_pull(fit: TargetFit, scaled: FloatArray, circle: IndexArray) -> FloatArray:
-    """Return the gradient (p, 2) by one pixel's growth of the outer and of the inner circle.
+def _gradient_by_growth(fit: TargetFit, scaled: FloatArray, circle: IndexArray) -> FloatArray:
+    """Return the gradients (p, 2) if the outer, or the inner, circle grew by one pixel.
 
-    Coming nearer by the share 1/r grows a circle of r pixels by one pixel.
+    A circle of r pixels grows by one pixel if it comes nearer by 1/r of its distance.
     """
     problem = fit.sample.problem
     per_pixel = -fit.misfit.weight / (fit.sd * problem.outer_radius_px / problem.outer_radius_m)
     by_approach = per_pixel * (fit.parameters.pose.translation_m @ fit.jacobian[:3])
-    pulls = np.zeros((2, len(by_approach)))
+    by_growth = np.zeros((2, len(by_approach)))
     for index, radius_m in enumerate(problem.circles.radii_m[:2]):
-        np.divide(by_approach, radius_m, out=pulls[index], where=circle == index)
-    return np.asarray(scaled @ pulls.T)
+        np.divide(by_approach, radius_m, out=by_growth[index], where=circle == index)
+    return np.asarray(scaled @ by_growth.T)
 
 
 def _nearest_edges(fit: TargetFit) -> tuple[IndexArray, IndexArray]:
@@ -310,18 +341,18 @@ def _number_arcs(
     return circle, arc
 
 
-def spread_over_both(pose: Pose, other: Pose, ambiguity: float) -> FloatArray:
+def ambiguity_cov(pose: Pose, other: Pose, ambiguity: float) -> FloatArray:
     """Return what the other pose adds to the covariance of the translation (3, 3) [m²].
 
-    It may be the right one, with the probability that goes with the ambiguity: the mean square of
-    the deviation from the reported one.
+    The other pose is the right one with the probability that belongs to the ambiguity. Its
+    difference from the reported one counts squared, with that probability.
     """
     apart_m = other.translation_m - pose.translation_m
     return np.asarray(expit(-0.5 * ambiguity) * np.outer(apart_m, apart_m))
 
 
 def propagate(camera: Camera, pose: Pose, pose_cov: FloatArray) -> Uncertainty:
-    """Carry the covariance of a pose to everything that is reported of it.
+    """Propagate the covariance of a pose to everything that is reported of it.
 
     Parameters
     ----------

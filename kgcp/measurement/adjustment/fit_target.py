@@ -18,7 +18,7 @@ from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.measurement.adjustment.acceptance import check_code, check_fit, check_precision
 from kgcp.measurement.adjustment.appearance import appearance_of, imaging_of
-from kgcp.measurement.adjustment.covariance import pose_covariance, propagate, spread_over_both
+from kgcp.measurement.adjustment.covariance import ambiguity_cov, pose_covariance, propagate
 from kgcp.measurement.adjustment.extensions import (
     UnevenLightInBins,
     fit_in_any_light,
@@ -249,7 +249,7 @@ def _measurement(
     covariance = pose_covariance(best)
     ambiguity = max(0.0, advantage(poses, covariance, prior))
     pose_cov = covariance.pose_cov.copy()
-    pose_cov[:3, :3] += spread_over_both(pose, other.parameters.pose, ambiguity)
+    pose_cov[:3, :3] += ambiguity_cov(pose, other.parameters.pose, ambiguity)
     if best.level_equations is not None and covariance.inflation > _UNEXPLAINED:
         pose_cov[:3, :3] += _spread_over_starts(best)
     of_other = pose_covariance(other).pose_cov if ambiguity < _DOUBTFUL_SIDE else None
