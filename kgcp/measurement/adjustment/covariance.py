@@ -138,7 +138,7 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
     # A − A N⁻¹ A
     scatter_left = np.sum(products.sum(axis=0) * to_pose) - np.sum((products @ inverse) * products)
     if fit.level_equations is not None:
-        scatter_left -= fit.level_equations.scatter_taken_over(of_pose, misfit.weight, arc)
+        scatter_left -= fit.level_equations.scatter_explained(of_pose, misfit.weight, arc)
     ratios, directions = np.linalg.eigh(
         sums.T @ sums / max(scatter_left / 6.0, _LEAST_SCATTER_LEFT)
     )

@@ -1,4 +1,4 @@
-"""Extensions of the plain model where its residuals need them: varying levels, other point spreads.
+"""Extensions of the plain model: levels that vary, and point spreads that are no Gaussians.
 
 The plain model is fitted first. If its residuals need no extension, its result stands.
 """
@@ -64,34 +64,34 @@ from kgcp.measurement.image_model.seen_shadows import SeenShadows
 from kgcp.measurement.image_model.shadow_edges import INK
 from kgcp.measurement.records import ToneBase
 
-_NUDGE = 1e-6  # without any skew or kurtosis, their derivatives are left out
-# Inflation of the covariance by residuals that agree along edges, where levels vary: above, the fit
-# has probably ended beside its minimum. Of 58 frames with dirt, the five whose fit did have 3.9 to
-# 5.7, and nearly all others less than 3.
+_NUDGE = 1e-6  # start value of skew and kurtosis: at 0, their derivatives would be left out
+# Residuals that agree along edges inflate the covariance. Where levels vary, a larger inflation
+# than this says that the fit has probably ended beside its minimum. In 58 simulated frames with
+# dirt, the five fits that had done so had inflations of 3.9 to 5.7, nearly all others less than 3.
 _OFF_MINIMUM_INFLATION = 3.0
-# χ² of the three shapes of an unknown curve against their priors, from which on no camera has it,
-# where levels vary. Of 64 rings of R 150 to 290 px in uneven light, half have 5 or less. Four have
-# 30 and more: three of them were off by 2.5, 4.8 and 8.7 σ.
+# Where levels vary, an unknown curve is implausible if its three shapes have a larger χ² than this
+# against their priors. Of 64 simulated rings of R 150 to 290 px in uneven light, half have 5 or
+# less. Four have 30 or more; three of these were off by 2.5, 4.8 and 8.7 σ.
 _IMPLAUSIBLE_CHI2 = 30.0
 _CURVE = [Param.TONE_1, Param.TONE_2, Param.TONE_3]
-# By how much levels that vary must be likelier on a small ring, in log-likelihood. Coarse prints
-# and coarse renderers, too, make residuals agree along edges: of five rings in even light that
-# levels explained better, four gained 9 to 19, and their errors grew from 0.04 to 0.06 %. Of 200
-# fits in uneven light, six gained less than 25; none was more than 2.3 σ off in even light.
+# Gain in log-likelihood that levels that vary must bring on a small ring. Coarse prints and coarse
+# renderers make residuals agree along edges, too. In even light, levels that vary fitted five rings
+# better: four gained 9 to 19, and their errors grew from 0.04 to 0.06 %. In uneven light, six of
+# 200 fits gained less than 25; fitted with even light, none of the six was off by more than 2.3 σ.
 _LEAST_ADVANTAGE_IN_SMALL_RING = 25.0
-# Share of a fit's pixels from which on too much is clipped for edges to tell two curves. With the
-# tone of edges free, 40 burnt plates half in shade have z of 2.0 and 1.7 by two phones; without it,
-# 1.6 and 1.4.
-_SOME_CLIPPED = 0.02
-_MOST_BURNT = 3.0  # brightest white that is started from, of what is seen of it
+# If a larger share of a fit's pixels is clipped, edges show too little to tell a tone of their own
+# from the tone curve. With that tone free, 40 burnt plates half in shade had z of 2.0 and 1.7 by
+# two simulated phones; without it, 1.6 and 1.4.
+_MOST_CLIPPED_FOR_EDGE_TONE = 0.02
+_MOST_BURNT = 3.0  # largest start value of a burnt white, relative to the clipped one that is seen
 
 
 class UnevenLightInBins(Exception):  # noqa: N818 - the outcome of one fit
-    """The light on bins seems uneven: smaller ones are to be adjusted, or single pixels."""
+    """The light seems uneven in bins: smaller bins are to be adjusted, or single pixels."""
 
 
 class WhiteIsBurnt(Exception):  # noqa: N818 - the outcome of one fit
-    """White is burnt below the end of the range: `problem` takes it for clipped."""
+    """White is burnt below the end of the range; `problem` takes it for clipped."""
 
     def __init__(self, problem: FitProblem) -> None:
         super().__init__()
@@ -100,10 +100,10 @@ class WhiteIsBurnt(Exception):  # noqa: N818 - the outcome of one fit
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FitsByTone:
-    """The fits of one target by the tones that its camera may have."""
+    """The fits of one target over the bases that an unknown tone curve may have."""
 
     likelier: TwoPoses
-    # over the other base; None: that fit failed or was not tried, or the tone is known
+    # the fit over the other base; None: it failed or was not tried, or the tone is known
     rival: TwoPoses | None
     advantage: float = 0.0  # of the likelier one, in log-likelihood
     untried_base: ToneBase | None = None  # None: both were tried, or the tone is known
@@ -112,16 +112,17 @@ class FitsByTone:
 def fit_in_any_light(
     problem: FitProblem, pose: Pose, blur: Blur, base: ToneBase | None = None
 ) -> FitsByTone:
-    """Adjust both poses; with an unknown tone over sRGB's curve and over a straight line.
+    """Adjust both poses in even or uneven light, an unknown tone over both of its bases.
 
-    Three shapes hold curves near either of them. White that turns out to be burnt is taken for
-    clipped over both.
+    The bases are sRGB's curve and a straight line. The three shapes of a fitted curve describe
+    curves near either of them. If white turns out to be burnt, it is taken for clipped, and both
+    fits are made anew.
 
     Parameters
     ----------
     base : ToneBase, optional
-        The one that other frames agree on. The other one is tried only if this fit fails, or seems
-        to have ended beside its minimum.
+        The base that other frames agree on. The other one is tried only if the fit over this one
+        fails, or seems to have ended beside its minimum.
 
     Raises
     ------
@@ -139,8 +140,14 @@ def fit_in_any_light(
 def _fit_over_bases(
     problem: FitProblem, pose: Pose, blur: Blur, base: ToneBase | None
 ) -> FitsByTone:
-    """Do what `fit_in_any_light` does; burnt white below the end of the range ends it."""
-    # the same whatever the tone
+    """Do what `fit_in_any_light` does.
+
+    Raises
+    ------
+    WhiteIsBurnt
+        If white is, and is not yet taken for clipped.
+    """
+    # plateaus are the same for both bases: they are found once
     find_plateaus = cache(partial(look_at_plateaus, problem, pose, blur.mean_sd_px))
     if problem.tone is not Tone.UNKNOWN:
         return FitsByTone(_fit_in_any_light(problem, pose, blur, find_plateaus), None)
@@ -180,8 +187,8 @@ def with_untried_base(fits: FitsByTone, pose: Pose, blur: Blur) -> FitsByTone:
 def _by_likelihood(fits: Mapping[ToneBase, TwoPoses]) -> FitsByTone:
     """Return the fits over one base or both, the likelier one first.
 
-    If only one of both has a plausible curve, and its residuals agree less, the other one counts as
-    failed.
+    If only one fit has a plausible curve, and its residuals agree less along edges, the other fit
+    counts as failed.
     """
     if len(fits) == 1:
         (alone,) = fits.values()
@@ -207,7 +214,7 @@ def _is_at_minimum(fit: TargetFit) -> bool:
 
 
 def _inflation(fit: TargetFit) -> float:
-    """Return by how much residuals inflate the covariance; infinite if there is none."""
+    """Return by how much residuals inflate the covariance; infinite if that is undefined."""
     try:
         return pose_covariance(fit).inflation
     except Rejection:
@@ -215,7 +222,7 @@ def _inflation(fit: TargetFit) -> float:
 
 
 def _is_curve_plausible(fit: TargetFit) -> bool:
-    """Tell whether a fit with levels that vary has a tone curve that some camera may have."""
+    """Tell whether a tone curve is one that a camera may have; always true in even light."""
     if fit.level_equations is None:
         return True
     shapes = fit.parameters.vector[_CURVE]
@@ -234,8 +241,8 @@ def _fit_in_any_light(
     Parameters
     ----------
     over_other_base : TwoPoses, optional
-        The fit of the same target over the other base of the tone curve, at its minimum. Where its
-        levels vary, it is the best start that there is.
+        The fit of the same target over the other base of the tone curve, at its minimum. If its
+        levels vary, it is the best start.
 
     Raises
     ------
@@ -270,7 +277,7 @@ def _best_in_any_light(
     if start is not None:
         plateaus = find_plateaus()
         if plateaus is not None and plateaus.is_uneven:
-            varying = _with_edge_tone(problem, _over_another_base(problem, start))
+            varying = _with_edge_tone(problem, _fit_over_other_base(problem, start))
             return _with_kurtosis(problem, varying)
     try:
         plain = _with_shape(problem, fit_both_poses(problem, pose, blur))
@@ -281,7 +288,7 @@ def _best_in_any_light(
             raise
         if problem.may_be_finer:
             raise UnevenLightInBins from None
-        return _in_seen_light(problem, pose, blur, plateaus)
+        return _fit_from_plateaus(problem, pose, blur, plateaus)
     if not needs_varying_levels(plain.best):
         return plain
     if problem.may_be_finer:
@@ -289,13 +296,13 @@ def _best_in_any_light(
     plateaus = find_plateaus()
     _raise_if_burnt(problem, plateaus)
     if start is not None:
-        varying = _with_edge_tone(problem, _over_another_base(problem, start))
+        varying = _with_edge_tone(problem, _fit_over_other_base(problem, start))
     elif plateaus is None or not plateaus.is_uneven:
         # the one tone parameter of bins holds only for the levels that it was fitted with
         seen = None if problem.tone is Tone.OF_BINS else plateaus
-        varying = _with_edge_tone(problem, _with_levels(problem, plain, seen))
+        varying = _with_edge_tone(problem, _with_varying_levels(problem, plain, seen))
     else:
-        varying = _in_seen_light(problem, pose, blur, plateaus)
+        varying = _fit_from_plateaus(problem, pose, blur, plateaus)
     return plain if _may_be_even(plain.best, varying.best) else varying
 
 
@@ -309,26 +316,27 @@ def _raise_if_burnt(problem: FitProblem, plateaus: Plateaus | None) -> None:
 
 
 def _may_be_even(plain: TargetFit, varying: TargetFit) -> bool:
-    """Tell whether levels that vary explain so little more that the light may be even.
+    """Tell whether levels that vary gain so little on a small ring that the light may be even.
 
-    If they explain less, their fit has ended beside its minimum and says nothing.
+    If they lose, their fit has ended beside its minimum and says nothing.
     """
     if not plain.sample.problem.is_ring_small:
         return False
     return 0.0 <= advantage_over(plain, varying) < _LEAST_ADVANTAGE_IN_SMALL_RING
 
 
-def _in_seen_light(problem: FitProblem, pose: Pose, blur: Blur, plateaus: Plateaus) -> TwoPoses:
-    """Adjust both poses with levels that vary from those that are seen on ink and plate."""
+def _fit_from_plateaus(problem: FitProblem, pose: Pose, blur: Blur, plateaus: Plateaus) -> TwoPoses:
+    """Adjust both poses with levels that vary, from a start that the plateaus show."""
     poses = fit_both_poses(evened_window(problem, plateaus), pose, blur)
-    varying = _with_shape(problem, _with_levels(problem, poses, plateaus))
+    varying = _with_shape(problem, _with_varying_levels(problem, poses, plateaus))
     return _with_kurtosis(problem, _with_edge_tone(problem, varying))
 
 
-def _over_another_base(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
-    """Adjust the better pose of a fit with levels that vary over another base of the tone curve.
+def _fit_over_other_base(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
+    """Adjust a fit with levels that vary over another base of the tone curve.
 
-    Levels are light before the curve, and remain what they are.
+    The start takes over its levels: they are light before the curve, and do not depend on the base.
+    The worse pose is not adjusted.
     """
     first = poses.best.parameters
     light = light_over(first.light, poses.best.sample.problem.tone, problem.tone)
@@ -338,7 +346,7 @@ def _over_another_base(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
 
 
 def _with_shape(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
-    """Let the point spread be skew, or of another kurtosis, if the residuals need it."""
+    """Make skew and kurtosis of the point spread free, if the residuals need it."""
     best, other = poses.best, poses.other
     shape = shape_needed(best)
     if not shape:
@@ -369,34 +377,36 @@ def _with_shape(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
 
 
 def _with_edge_tone(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
-    """Let edges have a tone of their own beside levels that vary, if they must.
+    """Give edges a tone of their own beside levels that vary, if residuals need it.
 
-    Then kurtosis may be asked for, which levels and the tone curve hid. Of plates that are burnt
-    only a part of each edge is seen, too little for two curves.
+    That may reveal a kurtosis that levels and tone curve hid. Burnt plates show only a part of each
+    edge, too little for two curves: they are left as they are.
     """
     best = poses.best
     if best.level_equations is None or not problem.tone.is_unknown or best.parameters.has_edge_tone:
         return poses
-    if np.mean(best.sample.censoring.is_clipped) > _SOME_CLIPPED:
+    if np.mean(best.sample.censoring.is_clipped) > _MOST_CLIPPED_FOR_EDGE_TONE:
         return poses
     unknowns = with_edge_tone(best.unknowns)
-    toned = _if_asked_for(problem, poses, unknowns, Param.EDGE_TONE, EDGE_TONE_CHI2)
+    toned = _with_parameter_if_needed(problem, poses, unknowns, Param.EDGE_TONE, EDGE_TONE_CHI2)
     return poses if toned is poses else _with_kurtosis(problem, toned)
 
 
 def _with_kurtosis(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
-    """Let the kurtosis of the point spread be free beside levels that vary, if it must be."""
+    """Make the kurtosis of the point spread free beside levels that vary, if residuals need it."""
     best = poses.best
     if best.level_equations is None or best.parameters.has_kurtosis:
         return poses
     unknowns = with_shape(best.unknowns, [int(Param.KURTOSIS)])
-    return _if_asked_for(problem, poses, unknowns, Param.KURTOSIS, KURTOSIS_CHI2_WITH_LEVELS)
+    return _with_parameter_if_needed(
+        problem, poses, unknowns, Param.KURTOSIS, KURTOSIS_CHI2_WITH_LEVELS
+    )
 
 
-def _if_asked_for(
+def _with_parameter_if_needed(
     problem: FitProblem, poses: TwoPoses, unknowns: Unknowns, param: Param, least_chi2: float
 ) -> TwoPoses:
-    """Fit with one more parameter if residuals ask for it by a χ²."""
+    """Fit with one more parameter if its score test exceeds a χ²."""
     with contextlib.suppress(Rejection):  # then it is better without
         if chi2_with_levels(poses.best, unknowns, param) > least_chi2:
             return _fit_shaped(
@@ -418,17 +428,21 @@ def _fit_shaped(
     return TwoPoses(shaped, fit_at(shaped, other))
 
 
-def _with_levels(problem: FitProblem, poses: TwoPoses, plateaus: Plateaus | None) -> TwoPoses:
-    """Let the levels vary: start from those seen on ink and plate, and from a shadow's edge.
+def _with_varying_levels(
+    problem: FitProblem, poses: TwoPoses, plateaus: Plateaus | None
+) -> TwoPoses:
+    """Adjust with levels that vary, started from those seen on ink and plate.
 
-    No tone curve is taken over: that of an evened image is another one, and in burnt images a plain
-    fit's has a white that is far too bright. Without plateaus the start is even light.
+    Starts with the edge of a shadow are tried first. Without plateaus the start is even light.
+
+    No tone curve is taken over. That of an evened image is another one, and that of a plain fit to
+    a burnt image has a white that is far too bright.
     """
     first = poses.best.parameters
     if plateaus is None:
-        # without what levels that vary replace
+        # without the parameters that levels that vary replace
         light = replace(first.light, slope_x=0.0, slope_y=0.0, curvature=0.0, linear_sharpening=0.0)
-        return _fitted(problem, poses, [Parameters.of(first.pose, first.blur, light)])
+        return _fit_varying_levels(problem, poses, [Parameters.of(first.pose, first.blur, light)])
     plateaus = look_at_plateaus(problem, first.pose, first.blur.mean_sd_px) or plateaus
     black, white = decoded(np.array(plateaus.extremes), problem.tone).tolist()
     light = Light(black, white)
@@ -436,18 +450,18 @@ def _with_levels(problem: FitProblem, poses: TwoPoses, plateaus: Plateaus | None
     smooth = replace(Parameters.of(first.pose, first.blur, light), field=field)
     shadows = reversed(shadows_across(problem, plateaus))
     edged = [_under_shadows(problem, first, seen) for seen in shadows]
-    return _fitted(problem, poses, [*edged, smooth])
+    return _fit_varying_levels(problem, poses, [*edged, smooth])
 
 
 def _under_shadows(problem: FitProblem, first: Parameters, seen: SeenShadows) -> Parameters:
     """Return the start with straight edges of shadows across the plate."""
     rows = seen.edges.rows.copy()
-    # a strip's second edge adds back what the first one takes
+    # the second edge of a strip of shadow adds back what the first one takes
     falls = rows[:, INK:].sum(axis=1, keepdims=True) < 0.0
     steps = np.where(falls, rows[:, INK:], -rows[:, INK:])
     beyond = decoded(np.maximum(seen.lit + steps, 0.0), problem.tone)
     ink, plate = decoded(np.maximum(seen.lit, 0.0), problem.tone).tolist()
-    # by a curve that is not known, the white that is seen is the scale
+    # if the curve is unknown, the white that is seen sets the scale
     if seen.is_burnt(problem.censoring.high) and not problem.tone.is_unknown:
         plate = _burnt_white(ink, plate, beyond)
     steps = (beyond - (ink, plate)) / (plate - ink)
@@ -458,10 +472,10 @@ def _under_shadows(problem: FitProblem, first: Parameters, seen: SeenShadows) ->
 
 
 def _burnt_white(ink: float, plate: float, beyond: FloatArray) -> float:
-    """Return the plate's level in the light where it is clipped.
+    """Estimate the plate's level in full light, where it is clipped.
 
-    Shade leaves the same share of ink and of plate, and what it leaves of ink is seen. `beyond`
-    (s, 2) are the levels of ink and plate there.
+    Shade reduces ink and plate by the same factor. The factor is seen on ink, and the plate is seen
+    in the shade. `beyond` (s, 2) are the levels of ink and plate there.
     """
     if ink <= 0.0:
         return plate
@@ -469,8 +483,8 @@ def _burnt_white(ink: float, plate: float, beyond: FloatArray) -> float:
     return float(np.clip(np.max(beyond[:, 1] / left), plate, _MOST_BURNT * plate))
 
 
-def _fitted(problem: FitProblem, poses: TwoPoses, starts: list[Parameters]) -> TwoPoses:
-    """Fit with levels that vary: these may hide a dot, which even levels must show."""
+def _fit_varying_levels(problem: FitProblem, poses: TwoPoses, starts: list[Parameters]) -> TwoPoses:
+    """Fit with levels that vary; these may hide a dot, so the code is checked with even ones."""
     check_code(poses.best)
     best = fit_levels(problem, starts, without_even_light(poses.best.unknowns))
     return TwoPoses(best, moved_to(best, poses.other.parameters.pose))

@@ -1,7 +1,8 @@
-"""The measurement: a model of the image fitted to the grey values around all circles.
+"""The measurement: a model of the image is fitted to the grey values around all circles.
 
-Started by the closed-form pose of an outline, good to a per cent or so. Both poses of the circle
-are adjusted; the one that fits better is reported, the other one kept with how much worse it fits.
+It starts from the closed-form pose of an outline, good to a per cent or so. Both poses of the
+circle are adjusted. The one that fits better is reported; the other one is kept, with how much
+worse it fits.
 """
 
 from __future__ import annotations
@@ -44,21 +45,25 @@ from kgcp.measurement.records import Alternative, InitialPose, Measurement, Riva
 from kgcp.targets.layout import Target
 
 _MARGIN_PX = 12.0
-_SHARP_PX2, _LARGEST_START_BLUR = 0.5, 0.15  # of the radius
+# Start of the blur: at least that of a sharp frame [px²], at most this share of the radius.
+_SHARP_PX2, _LARGEST_START_BLUR = 0.5, 0.15
 _LARGEST_RADIUS_PX = 150.0  # enough for the last digit that calibrations can tell
-# All that bins know of a tone curve or of clipping is how far they displace edges, which in uneven
-# light is not the same everywhere. Distances of 30 simulated rings of R 150 to 275 px half in
-# shade, with dirt, or under highlights were off by up to 0.03 %. So many single pixels, spread over
-# them, leave up to 0.0045 %, and take 0.1 to 1.2 s. Compression, too, makes bins seem to be in
-# uneven light: 20 of 40 rings of R 150 to 450 px in JPEGs. Still larger rings are seen in bins
-# again, which bounds the memory.
+# All that a bin shows of a tone curve or of clipping is how far they displace an edge. In uneven
+# light that is not the same along a circle: in bins, distances of 30 simulated rings of R 150 to
+# 275 px, half in shade, with dirt or under highlights, were off by up to 0.03 %. So single pixels
+# are adjusted there instead, this many, spread over the ring: distances are off by up to 0.0045 %,
+# in 0.1 to 1.2 s. Compression makes the light in bins seem uneven, too: on 20 of 40 rings of R 150
+# to 450 px in JPEGs. Rings above the second limit are binned again, which bounds the memory.
 _MOST_PIXELS, _LARGEST_UNEVEN_PX = 6000, 450.0
-_DOUBTFUL_SIDE = 10.0  # Δχ² of the other pose below which more than this frame is asked
+# Below this ambiguity (Δχ² of the other pose), other frames may choose the other pose: so it gets a
+# covariance, too.
+_DOUBTFUL_AMBIGUITY = 10.0
 _NOTHING_KNOWN = PlatePrior()
-# Enlargement of the covariance by residuals that agree, where levels vary: of 480 simulated plates
-# in uneven light, three under highlights have more. One of them was 4.1 σ off.
-_UNEXPLAINED = 8.0
-_SHARPENING_PX = 1.2  # usual in cameras; 0.7 … 1.7 change little, see docs/method.md
+# Where levels vary, a larger inflation of the covariance says that they do not explain the light.
+# Of 480 simulated plates in uneven light, three have more, all under highlights; one of them was
+# 4.1 σ off.
+_UNEXPLAINED_INFLATION = 8.0
+_SHARPENING_PX = 1.2  # usual in cameras; 0.7 to 1.7 change little (docs/method.md, "Light")
 
 
 def measure_by_model(
@@ -78,8 +83,8 @@ def measure_by_model(
     target : Target
         Its layout.
     prior : PlatePrior, optional
-        Its normal only helps to choose between the two poses, whose values remain those of the
-        image. Its base of the tone curve is the only one that is tried, unless it leads nowhere.
+        Its normal only helps to choose between the two poses; their values are from the image
+        alone. Its base of the tone curve is the only one that is tried, unless that fit fails.
     visible : (m,) array of bool, optional
         Where the target is seen, in equal steps about its normal from its +x axis on.
 
@@ -122,7 +127,7 @@ def _checked(
     poses: TwoPoses,
     prior: NormalPrior | None,
 ) -> Measurement:
-    """Choose between the two poses, and make the measurement of a fit that may be believed."""
+    """Choose between the two poses, test the fit, and make the measurement."""
     if prior is not None:
         poses = choose_by_prior(poses.best.sample.problem, poses, prior)
     check_fit(poses.best)
@@ -133,15 +138,15 @@ def _checked(
 
 
 def _outlined_radius_px(start: InitialPose, target: Target) -> float:
-    """Return the outer radius of the ring that the start was found by: a replica, perhaps."""
+    """Return the outer radius of the ring that the search has found, which may be a replica."""
     (outlined,) = (ring for ring in target.rings if ring.name == start.ring)
     return start.radius_px * outlined.outer_diameter_m / target.ring.outer_diameter_m
 
 
 def _without_edge_shift(start: InitialPose, outlined_px: float) -> Pose:
-    """Return the pose that the start would have if the outer edge were not displaced.
+    """Return the start pose, corrected for the displacement δ of the outer edge.
 
-    Its distance is from the outer circle alone, of which the radius is short by δ.
+    The start's distance is from the outer circle alone, whose radius is too small by δ.
     """
     shrink = outlined_px / (outlined_px + start.edge_shift_px)
     return Pose(start.pose.rotation, shrink * start.pose.translation_m)
@@ -155,14 +160,15 @@ def fit_problem_of(
     rotation: SceneRotation | None = None,
     largest_radius_px: float = _LARGEST_RADIUS_PX,
 ) -> FitProblem:
-    """Collect what the adjustment starts from: the main ring, or a replica where that is cut.
+    """Collect what is adjusted: the main ring, or a replica where the main ring is cut.
 
     Parameters
     ----------
     rotation : SceneRotation, optional
         Of the scene during the readout; None: `SceneRotation.unknown`.
     largest_radius_px : float
-        Of a larger ring, squares of pixels are taken together in bins, such that none is left.
+        Pixels of a larger ring are averaged in square bins, so that its radius is at most this
+        many bins.
     """
     count = 0
     for ring in target.rings:
@@ -213,7 +219,7 @@ def finer_problem_of(
     pose: Pose,
     rotation: SceneRotation | None = None,
 ) -> FitProblem:
-    """Do what `fit_problem_of` does, for uneven light: on smaller bins, or some single pixels."""
+    """Do what `fit_problem_of` does, with smaller bins or some single pixels, for uneven light."""
     finer = fit_problem_of(grey, camera, target, pose, rotation, _LARGEST_UNEVEN_PX)
     return replace(finer, most_pixels=_MOST_PIXELS)
 
@@ -221,17 +227,17 @@ def finer_problem_of(
 def _measured_count(camera: Camera, target: Target, contour: FloatArray) -> int:
     """Return how many of a target's circles are measured: the main ring's, or all if it is cut.
 
-    A whole main ring, which has this contour, leaves its replicas little to add to the distance, at
-    twice the time.
+    While the main ring is whole, its replicas add little to the distance, at twice the time.
+    `contour` is that of the main ring.
     """
     (left, top), (right, bottom) = contour.min(axis=0), contour.max(axis=0)
-    whole = min(left, top) > 0.0 and right < camera.width - 1.0 and bottom < camera.height - 1.0
-    rings = (target.ring,) if whole else target.rings
+    is_whole = min(left, top) > 0.0 and right < camera.width - 1.0 and bottom < camera.height - 1.0
+    rings = (target.ring,) if is_whole else target.rings
     return sum(2 + len(ring.code_deg) for ring in rings)
 
 
 def _start_blur(blur_px: float, outlined_px: float, binning: int) -> Blur:
-    """Return the blur that the start has seen, in bins; that of a sharp frame at least."""
+    """Return the blur that the search has found, in bins; at least that of a sharp frame."""
     seen_px = min(blur_px, _LARGEST_START_BLUR * outlined_px)
     variance = variance_in_bins(max(_SHARP_PX2, seen_px * seen_px), binning)
     return Blur(variance, variance, 0.0)
@@ -250,9 +256,9 @@ def _measurement(
     ambiguity = max(0.0, advantage(poses, covariance, prior))
     pose_cov = covariance.pose_cov.copy()
     pose_cov[:3, :3] += ambiguity_cov(pose, other.parameters.pose, ambiguity)
-    if best.level_equations is not None and covariance.inflation > _UNEXPLAINED:
+    if best.level_equations is not None and covariance.inflation > _UNEXPLAINED_INFLATION:
         pose_cov[:3, :3] += _spread_over_starts(best)
-    of_other = pose_covariance(other).pose_cov if ambiguity < _DOUBTFUL_SIDE else None
+    other_cov = pose_covariance(other).pose_cov if ambiguity < _DOUBTFUL_AMBIGUITY else None
     measurement = Measurement(
         target=target.name,
         ring=start.ring,
@@ -263,7 +269,7 @@ def _measurement(
         heading_deg=image_heading_deg(camera, pose),
         appearance=appearance_of(camera, target, best),
         imaging=imaging_of(best),
-        alternative=Alternative(other.parameters.pose, ambiguity, of_other),
+        alternative=Alternative(other.parameters.pose, ambiguity, other_cov),
         uncertainty=propagate(camera, pose, pose_cov),
         smoothing=contour_smoothing(best, covariance.inflation),
     )
@@ -273,13 +279,13 @@ def _measurement(
 def _spread_over_starts(best: TargetFit) -> FloatArray:
     """Return what another start adds to the covariance of the translation (3, 3) [m²].
 
-    Where the levels do not explain the light, it decides where the fit comes to rest. The other one
-    is even light.
+    Where the levels do not explain the light, the result depends on the start. So the fit is
+    repeated from even light, and the difference counts as a deviation.
 
     Raises
     ------
     Rejection
-        If that leads nowhere: then nothing tells how far off the pose may be.
+        If that fit fails: then nothing tells how far off the pose may be.
     """
     problem, pose = best.sample.problem, best.parameters.pose
     even = replace(best.parameters, field=even_field(problem))

@@ -1,11 +1,12 @@
-"""Normal equations with many values of levels, of which each pixel depends on few.
+"""Normal equations with levels that vary: many unknowns, few of which a pixel depends on.
 
-The levels are random: they have a prior of zero mean. They are eliminated from the equations of all
-else by the Schur complement, so that those remain as small as without levels:
+The levels are values at knots, with a prior of zero mean. They are eliminated from the equations of
+all other parameters by the Schur complement, so that these remain as small as without levels:
 
-    N = A − B C⁻¹ Bᵀ,
+    N = A − B C⁻¹ Bᵀ
 
-with A of pose, blur, light and shadows' edges, C of the levels with their prior, and B mixed.
+A is the normal matrix of pose, blur, light and shadows' edges, C that of the levels with their
+prior, and B has the mixed terms.
 """
 
 from __future__ import annotations
@@ -23,19 +24,19 @@ from kgcp.measurement.image_model.noise import Misfit
 
 
 class AtKnots(NamedTuple):
-    """The knots that pixels depend on, cell by cell: all pixels of a cell have the same."""
+    """The knots that pixels depend on. All pixels of a cell depend on the same knots."""
 
-    order: IndexArray  # (n,): the pixels
-    starts: IndexArray  # (c + 1,): those of cell i are order[starts[i]:starts[i + 1]]
-    knots: IndexArray  # (c, j): of every cell
-    weights: FloatArray  # (n, j): by how much pixels depend on them, in that order
+    order: IndexArray  # (n,): the pixels, sorted by cell
+    starts: IndexArray  # (c + 1,): the pixels of cell i are order[starts[i]:starts[i + 1]]
+    knots: IndexArray  # (c, j): the knots of every cell
+    weights: FloatArray  # (n, j): weights of the knots in every pixel, sorted as `order`
 
     @staticmethod
     def of(knots: IndexArray, weights: FloatArray) -> AtKnots:
         """Put the pixels of each cell together.
 
-        Of every pixel, the knots (n, j) and their weights (n, j) are given, one pixel at least. The
-        first and the last knot tell the others, as they do on two grids.
+        Given are the knots (n, j) of every pixel and their weights (n, j), for one pixel at least.
+        The first and the last knot of a pixel must determine the others, as they do on two grids.
         """
         ends = knots[:, 0], knots[:, -1]
         order = np.lexsort(ends)
@@ -48,13 +49,13 @@ class AtKnots(NamedTuple):
 class LevelEquations:
     """The equations of one linearisation, the levels eliminated."""
 
-    scaled: FloatArray  # (p, n): Jacobian by all else, in units of the noise
+    scaled: FloatArray  # (p, n): Jacobian by the p other parameters, in units of the noise
     normal: FloatArray  # (p, p): normal matrix, priors included
     at_knots: AtKnots
     # (2, n): derivatives by the levels of ink and of plate, in units of the noise
     by_level: FloatArray
-    count: int  # of the knots
-    # (q,): the values that some pixel depends on: of ink at all knots, then of plate
+    count: int  # k, of the knots
+    # (q,): which of the 2 k levels (of ink at all knots, then of plate) any pixel depends on
     used: IndexArray
     root: FloatArray  # (q, q): Cholesky factor of C, the lower triangle
     half_mixed: FloatArray  # (q, p): L⁻¹ Bᵀ, with C = L Lᵀ
@@ -70,28 +71,28 @@ class LevelEquations:
         return solved(self.root, gradient)
 
     def step_of_levels(self, half: FloatArray, step: FloatArray) -> FloatArray:
-        """Return the levels' step (2, k) that goes with that of all else (p,).
+        """Return the step (2, k) of the levels that belongs to a step (p,) of the others.
 
-        `half` is their gradient, `half_solved`.
+        `half` is the gradient of the levels after `half_solved`.
         """
         values = np.zeros(2 * self.count)
-        rest = half - self.half_mixed @ step
-        values[self.used] = solved(self.root, rest, is_transposed=True)
+        remaining = half - self.half_mixed @ step
+        values[self.used] = solved(self.root, remaining, is_transposed=True)
         return values.reshape(2, -1)
 
     def projected(self) -> FloatArray:
-        """Return B C⁻¹ (p, q): how the levels move with all else."""
+        """Return B C⁻¹ (p, q): how the levels follow the other parameters."""
         return solved(self.root, self.half_mixed, is_transposed=True).T
 
     def rows(self) -> FloatArray:
-        """Return the Jacobian (p, n) less what the levels take over of it."""
+        """Return the Jacobian (p, n) without the part that the levels explain."""
         rows, by_knot = self.scaled.copy(), np.zeros((2 * self.count, len(self.scaled)))
         by_knot[self.used] = self.projected().T
-        _take_over(*self.at_knots, self.by_level, by_knot, rows)
+        _subtract_explained(*self.at_knots, self.by_level, by_knot, rows)
         return rows
 
-    def scatter_taken_over(self, of_pose: FloatArray, weight: FloatArray, arc: IndexArray) -> float:
-        """Return how much of the scatter (its trace) of sums over arcs the levels take over.
+    def scatter_explained(self, of_pose: FloatArray, weight: FloatArray, arc: IndexArray) -> float:
+        """Return the trace of the scatter of sums over arcs that the levels explain.
 
         The sums are those of the scores times the derivatives `of_pose` (n, 6).
         """
@@ -99,15 +100,15 @@ class LevelEquations:
         half = solved(self.root, parts.reshape(-1, 2 * self.count)[:, self.used].T)
         return float(np.sum(half * half))
 
-    def square_taken_over(self, row: FloatArray, weight: FloatArray) -> float:
-        """Return how much of the weighted square of a row (n,) the levels take over."""
+    def square_explained(self, row: FloatArray, weight: FloatArray) -> float:
+        """Return the part of the weighted square of a row (n,) that the levels explain."""
         half = self.half_solved(
             gather(self.at_knots, self.by_level, row * weight, self.count)[self.used]
         )
         return float(half @ half)
 
     def variances(self) -> FloatArray:
-        """Return the variances (q,) of the levels; all other parameters are unknown, too."""
+        """Return the variances (q,) of the levels, with all other parameters unknown."""
         inverse, _ = dtrtri(self.root, lower=1)
         projected = self.projected()
         by_others = np.linalg.lstsq(self.normal, projected, rcond=1e-12)[0]
@@ -158,7 +159,7 @@ def solved(root: FloatArray, vectors: FloatArray, *, is_transposed: bool = False
 
 
 def gather(at_knots: AtKnots, by_level: FloatArray, values: FloatArray, count: int) -> FloatArray:
-    """Return Σ values · derivatives over pixels, by the levels of ink and plate at knots (2 k,)."""
+    """Sum values times derivatives over pixels, for the levels of ink and plate at knots (2 k,)."""
     return _gather(*at_knots, by_level, values, count)
 
 
@@ -199,10 +200,10 @@ def _products(
     scaled: FloatArray,
     count: int,
 ) -> tuple[FloatArray, FloatArray, IndexArray]:
-    """Return the levels' own normal matrix, the mixed one (p, q), and the values that are used.
+    """Return the normal matrix C (q, q) of the levels, the mixed one B (p, q), and which are used.
 
-    Of the levels' own matrix only the upper triangle is filled in. A cell's pixels are summed up by
-    one product of small matrices.
+    Only the upper triangle of C is filled in. The pixels of a cell are summed up by one product of
+    small matrices.
     """
     reach, rows = knots.shape[1], scaled.shape[0]
     used, number = _used(starts, knots, weights, count)
@@ -226,9 +227,10 @@ def _products(
 def _fill_products(
     shares: FloatArray, by_level: FloatArray, weight: float, by_row: FloatArray, out: FloatArray
 ) -> None:
-    """Fill in a pixel's weighted products: ink · ink, ink · plate and plate · plate with its knots.
+    """Fill in the weighted products of a pixel's derivatives.
 
-    Then those of ink, and of plate, with all rows.
+    First come ink · ink, ink · plate and plate · plate, each times the shares of its knots; then
+    ink, and plate, times all rows.
     """
     reach, rows = len(shares), len(by_row)
     of_ink, of_plate = weight * by_level[0], weight * by_level[1]
@@ -243,7 +245,7 @@ def _fill_products(
 def _add_cell(
     cell: FloatArray, knots: IndexArray, number: IndexArray, own: FloatArray, mixed: FloatArray
 ) -> None:
-    """Add the sums of a cell, by its knots and as of `_fill_products`, where they belong."""
+    """Add the sums of a cell, laid out as by `_fill_products`, to both matrices."""
     reach, q = len(knots), len(own) // 2
     for j in range(reach):
         a = number[knots[j]]
@@ -264,7 +266,7 @@ def _add_cell(
 def _used(
     starts: IndexArray, knots: IndexArray, weights: FloatArray, count: int
 ) -> tuple[IndexArray, IndexArray]:
-    """Return the knots (q,) that pixels use, and of every knot its number among them."""
+    """Return the knots that pixels use, and the number of every knot among them; −1: not used."""
     number = np.full(count, -1, np.intp)
     for cell in range(len(knots)):
         for j in range(knots.shape[1]):
@@ -278,7 +280,7 @@ def _used(
 
 
 @compiled
-def _take_over(
+def _subtract_explained(
     order: IndexArray,
     starts: IndexArray,
     knots: IndexArray,
@@ -311,7 +313,7 @@ def _by_arc(
     arc: IndexArray,
     count: int,
 ) -> FloatArray:
-    """Return the normal matrices (arcs, 6, 2 k) of the pose and the levels, of every arc."""
+    """Return the mixed normal matrices (arcs, 6, 2 k) of pose and levels, for every arc."""
     parts = np.zeros((arc.max() + 1, 6, 2 * count))
     for cell in range(len(knots)):
         for m in range(starts[cell], starts[cell + 1]):

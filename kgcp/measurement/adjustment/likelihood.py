@@ -1,9 +1,10 @@
 """Which of two fits of one target is the likelier one.
 
-Every fit has pixels and noise of its own, so that sums over its pixels do not compare with those of
-another fit. Both are held against the same pixels therefore: those of either, in turn. A fit of
-more unknowns comes nearer to any pixels; Laplace's approximation of the evidence takes off what
-that is worth: of a prior, only the share that the pixels leave counts.
+Every fit has its own pixels and noise, so that the sums over them cannot be compared. Therefore
+both fits are compared on the same pixels: those of the one, then those of the other.
+
+A fit with more unknowns comes nearer to any pixels. Laplace's approximation of the evidence allows
+for that: it counts how much of the volume of its priors a fit leaves.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ def advantage_over(other: TargetFit, fit: TargetFit) -> float:
         _loss(other, sample) - _loss(fit, sample) for sample in (fit.sample, other.sample)
     )
     is_even = fit.level_equations is None and other.level_equations is None
-    if is_even:  # where levels vary, both have as many unknowns
+    if is_even:  # where levels vary, both fits have the same number of unknowns
         advantage += _loss_of_volume(other) - _loss_of_volume(fit)
     return advantage
 
 
 def _loss_of_volume(fit: TargetFit) -> float:
-    """Return the negative logarithm of the priors' share that a fit leaves, up to a constant."""
+    """Return −log of the share of the priors' volume that a fit leaves, up to a constant."""
     normal = normal_matrix(fit.scaled_jacobian, fit.misfit, fit.unknowns)
     precision = fit.unknowns.free_precision
     of_priors = float(np.sum(np.log(precision[precision > 0.0])))
@@ -38,9 +39,9 @@ def _loss_of_volume(fit: TargetFit) -> float:
 
 
 def _loss(fit: TargetFit, sample: Sample) -> float:
-    """Return the negative log-likelihood of a sample's pixels by a fit, the priors included.
+    """Return the negative log-likelihood of a sample's pixels under a fit, with the priors.
 
-    Noise is what the fit leaves there, which is part of the likelihood.
+    The noise is estimated from the residuals of the fit there. It is part of the likelihood.
     """
     tone = fit.sample.problem.tone
     toned = replace(

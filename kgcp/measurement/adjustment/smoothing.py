@@ -51,7 +51,7 @@ def contour_smoothing(fit: TargetFit, inflation: float) -> ContourSmoothing | No
         normal = normal_matrix(scaled, fit.misfit, fit.unknowns)
     else:
         scaled, normal = fit.level_equations.rows(), fit.level_equations.normal
-        own -= fit.level_equations.square_taken_over(row, weight)
+        own -= fit.level_equations.square_explained(row, weight)
     mixed = scaled @ (row * weight)
     moves = np.asarray(-np.linalg.solve(normal, mixed), np.float64)
     precision = own + float(mixed @ moves)

@@ -92,4 +92,4 @@ def test_what_levels_take_over_is_their_projection(problem: Problem) -> None:
     for number in range(4):
         part = (of_pose * weight[:, None])[arc == number].T @ of_levels[arc == number]
         taken += float(np.trace(part @ np.linalg.solve(own, part.T)))
-    assert equations.scatter_taken_over(of_pose, weight, arc) == pytest.approx(taken, rel=1e-10)
+    assert equations.scatter_explained(of_pose, weight, arc) == pytest.approx(taken, rel=1e-10)
