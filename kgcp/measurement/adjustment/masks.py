@@ -1,9 +1,9 @@
-"""What is not the target: surroundings of its plate, and what hides a part of it.
+"""Masks of pixels that do not show the target: surroundings of its plate, and what hides a part.
 
-Both are found before the adjustment, by an approximate pose, blur and light: where grey values
-cannot be those of the plate. Whatever blur may have mixed with such pixels is left out, too. The
-rules are local and one-sided, since leaving out too much costs a little accuracy and leaving out
-too little biases the distance. docs/method.md, "Masks", derives them.
+Both are found before the adjustment, with an approximate pose, blur and light: they are where grey
+values cannot be those of the plate. All pixels that blur may have mixed with them are left out,
+too. The rules are local and rather leave out too much: that costs a little accuracy, while leaving
+out too little biases the distance. docs/method.md, "Masks", derives them.
 """
 
 from __future__ import annotations
@@ -24,24 +24,26 @@ from kgcp.measurement.image_model.photometry import Light, light_of_levels, plat
 from kgcp.measurement.image_model.plate import blur_on_plate, largest_metres_per_px
 from kgcp.measurement.image_model.unblurred import UnblurredPlate, unblurred_plate
 
-# Tuning of the masks, in units of the blur's σ and of the contrast. Benchmarks: the sets `hidden`
-# and `cut` of `benchmarks.search.hard_frames`, for what hides a part;
-# tests/measurement/test_obstacles.py and adjustment/test_pixels.py, for the bias that dirt, shadows
-# and surroundings leave; `benchmarks.accuracy.presets` (`far`, `consumer`), for what is lost.
-_BLURRED_SHARE = 0.7  # of ink and of plate, that is too near to edges for the level
+# Tuning of the masks, in units of the blur's σ and of the contrast. What hides a part is measured
+# by the sets `hidden` and `cut` of `benchmarks.search.hard_frames`. The bias that dirt, shadows and
+# surroundings leave is measured by tests/measurement/test_obstacles.py and
+# adjustment/test_pixels.py, and what is lost by `benchmarks.accuracy.presets` (`far`, `consumer`).
+_BLURRED_SHARE = 0.7  # share of the ink's and of the plate's pixels that is too near to edges
 _ENOUGH_PIXELS = 2000  # for a median
 _CLEAR_SIGMAS = 2.6  # from an edge on, ink and plate show their own levels: Φ(−2.6) is 0.5 %
-_FOREIGN_CONTRAST = 0.15  # off the plate's level: not plate, or mixed with what is not …
-_FOREIGN_SIGMAS = 2.0  # … and so much farther its blur is felt
+_FOREIGN_CONTRAST = 0.15  # a pixel so far off the plate's level is not plate, or not alone
+_FOREIGN_SIGMAS = 2.0  # reach of the blur around such a pixel
 _BESIDE_RING_SIGMAS = 0.85  # from there on, grey values hardly depend on the camera's tone
-_HIDDEN_CONTRAST = 0.25  # off the level of ink or plate
-_NO_EDGE_SIGMAS, _NO_EDGE_CONTRAST = 1.2, 0.5  # so near an edge, this side still looks like that
-_NO_EDGE_OUTSIDE_SIGMAS = 1.9  # beyond, the plate may end
-_HIDDEN_SIGMAS = 4.0  # from there through the next edge
-_SMALLEST_SIGMAS = 12.0  # radius; smaller rings hardly show the level of ink anywhere
-_MAX_HIDDEN = 0.5  # of the tested pixels; above, it is no plate, or the light is another
-_DOT_AREAS, _DOTS = 1.5, 1.6  # larger than a dot with what blur adds to it, or longer
-_SCALE_PIXELS = 100  # enough to see how the plate's scale varies
+_HIDDEN_CONTRAST = 0.25  # a clear pixel so far off the level of ink or plate is hidden
+# From this distance on, a pixel beside an edge that is off by so much shows that the edge is
+# missing
+_NO_EDGE_SIGMAS, _NO_EDGE_CONTRAST = 1.2, 0.5
+_NO_EDGE_OUTSIDE_SIGMAS = 1.9  # farther outside the ring, the plate may end
+_HIDDEN_SIGMAS = 4.0  # left out around a hidden pixel: through the next edge
+_SMALLEST_SIGMAS = 12.0  # least radius of a ring that is tested: smaller ones hardly show ink
+_MAX_HIDDEN = 0.5  # of the tested pixels; if there are more, pose or light are wrong
+_DOT_AREAS, _DOT_LENGTHS = 1.5, 1.6  # a hidden patch that is larger, or longer, is no dot
+_SCALE_PIXELS = 100  # enough to find the largest scale on the plate
 _SMALL_SIGMAS = 3.0  # discs of smaller radii do not show their own level
 
 
@@ -50,21 +52,21 @@ class SeenPlate:
     """A window under an approximate pose, blur and light."""
 
     problem: FitProblem
-    metres_per_px: float  # largest length on the plate that a pixel spans
+    metres_per_px: float  # largest length on the plate that any pixel spans
     blur: Blur
     spread: FloatArray  # (3,): by `blur_on_plate`
-    # under every pixel, with small discs and edges in reach by `see_plate`
+    # the plate under every pixel, with small discs and edges in reach as chosen by `see_plate`
     unblurred: UnblurredPlate
 
     def dilated(self, pixels: BoolArray, kernel: GreyArray) -> BoolArray:
-        """Return pixels (n,) with all that a kernel around them covers."""
+        """Return pixels (n,) grown by a kernel."""
         shape = self.problem.window.height, self.problem.window.width
         reached = cv2.dilate(pixels.reshape(shape).view(np.uint8), kernel)
         return np.asarray(reached.ravel().view(np.bool_))
 
 
 def see_plate(problem: FitProblem, pose: Pose, blur: Blur, slack_px: float = 0.0) -> SeenPlate:
-    """Prepare a window for its masks and its pixels; the pose may be off by `slack_px`."""
+    """Prepare a window for masks and pixel selection; the pose may be off by `slack_px`."""
     rays, sd_px = problem.window.rays, blur.largest_sd_px
     step = max(1, rays.shape[1] // _SCALE_PIXELS)
     scale = largest_metres_per_px(pose, np.ascontiguousarray(rays[:, ::step]))
@@ -84,7 +86,7 @@ def see_plate(problem: FitProblem, pose: Pose, blur: Blur, slack_px: float = 0.0
 
 
 def first_levels(problem: FitProblem, pose: Pose) -> Light:
-    """Return black and white as medians of what an approximate pose takes for ink and plate.
+    """Return black and white as medians of the ink and the plate under an approximate pose.
 
     Raises
     ------
@@ -95,7 +97,7 @@ def first_levels(problem: FitProblem, pose: Pose) -> Light:
     step = _step_across_columns(window.rays.shape[1] // _ENOUGH_PIXELS, window.width)
     some = slice(None, None, step)
     levels = np.ascontiguousarray(window.levels[some])
-    outer_m, inner_m = problem.circles.radii_m[:2]  # dots are nowhere nearer than the ring's edges
+    outer_m, inner_m = problem.circles.radii_m[:2]  # dots are within the ring
     rays = np.ascontiguousarray(window.rays[:, some])
     circles, count = problem.circles, problem.measured_count
     unblurred = unblurred_plate(circles, count, pose, rays, reach_m=outer_m - inner_m)
@@ -123,15 +125,15 @@ def _median_levels(
     off_edge_m: FloatArray,
     radius_m: float,
 ) -> tuple[float, float]:
-    """Return the levels of ink and plate within a radius, as medians of what is clear of edges."""
-    seen, off, found = np.empty((2, len(levels))), np.empty((2, len(levels))), np.zeros(2, np.intp)
+    """Return the levels of ink and plate within a radius, as medians of pixels clear of edges."""
+    seen, off, count = np.empty((2, len(levels))), np.empty((2, len(levels))), np.zeros(2, np.intp)
     for i in range(len(levels)):
         if rho_m[i] < radius_m:
             kind = 0 if share[i] < 0.5 else 1
-            seen[kind, found[kind]], off[kind, found[kind]] = levels[i], off_edge_m[i]
-            found[kind] += 1
-    ink = _median_of_clearest(seen[0, : found[0]], off[0, : found[0]])
-    return ink, _median_of_clearest(seen[1, : found[1]], off[1, : found[1]])
+            seen[kind, count[kind]], off[kind, count[kind]] = levels[i], off_edge_m[i]
+            count[kind] += 1
+    ink = _median_of_clearest(seen[0, : count[0]], off[0, : count[0]])
+    return ink, _median_of_clearest(seen[1, : count[1]], off[1, : count[1]])
 
 
 @compiled
@@ -144,7 +146,7 @@ def _median_of_clearest(levels: FloatArray, off_edge_m: FloatArray) -> float:
 
 
 def background_mask(seen: SeenPlate, light: Light, slack_px: float = 0.0) -> BoolArray:
-    """Tell which pixels (n,) of the window blur may mix with something that is not plate.
+    """Tell which pixels (n,) of the window may be mixed by blur with what is not plate.
 
     The pose may be off by `slack_px`.
     """
@@ -185,9 +187,10 @@ def _mark_foreign(
 ) -> int:
     """Mark what is not plate outside a ring; return how many pixels that are.
 
-    Beyond 2.6 σ from the ring, by a level that is not the plate's. Nearer, where the end of the
-    plate may be within the blur of the ring, by one that is darker than Φ(distance / σ), the
-    profile of the ring's own edge, makes it; σ is that of the blur in the pixel's direction.
+    Farther than 2.6 σ from the ring, a pixel is marked if its level is not the plate's. Nearer, the
+    plate may end within the blur of the ring: there a pixel is marked if it is darker than the
+    profile of the ring's own edge, Φ(distance / σ), with the σ of the blur in its direction.
+
     `levels` are those of ink and plate, and the one that burnt white is seen with.
     """
     black, white, brightest = levels
@@ -198,8 +201,8 @@ def _mark_foreign(
             foreign[i] = abs(smooth[i] - level) > _FOREIGN_CONTRAST * (white - black)
         elif beyond_m > slack_m:
             x, y = points_m[0, i], points_m[1, i]
-            felt = spread[0] * x * x + 2.0 * spread[1] * x * y + spread[2] * y * y
-            sigmas = (beyond_m - slack_m) * rho_m[i] / (sd_m * math.sqrt(felt))
+            variance = spread[0] * x * x + 2.0 * spread[1] * x * y + spread[2] * y * y
+            sigmas = (beyond_m - slack_m) * rho_m[i] / (sd_m * math.sqrt(variance))
             if sigmas > _BESIDE_RING_SIGMAS:
                 share = 1.0 - 0.5 * math.erfc(sigmas * math.sqrt(0.5)) - _FOREIGN_CONTRAST
                 foreign[i] = smooth[i] < min(black + (white - black) * share, brightest)
@@ -209,7 +212,7 @@ def _mark_foreign(
 
 @compiled
 def _fill_ellipse(xx: float, yy: float, xy: float, sigmas: float, kernel: GreyArray) -> None:
-    """Fill in 1 within so many sigmas of a blur about the middle, 0 elsewhere."""
+    """Fill in 1 within so many σ of a blur around the middle, 0 elsewhere."""
     half, limit = kernel.shape[0] // 2, sigmas * sigmas * (xx * yy - xy * xy)
     for row in range(-half, half + 1):
         for column in range(-half, half + 1):
@@ -220,10 +223,11 @@ def _fill_ellipse(xx: float, yy: float, xy: float, sigmas: float, kernel: GreyAr
 def occluded_mask(seen: SeenPlate, light: Light, slack_px: float) -> BoolArray:
     """Tell which pixels (n,) of the window show something other than ink and plate.
 
-    They show by levels that are neither those of ink nor of plate where the plate is flat, and by
-    missing edges, beside which grey values are those of the other side. The pose may be off by
-    `slack_px`. If more than half of all tested pixels show something else, the light or the pose is
-    wrong rather than the target hidden, and nothing is left out.
+    Clear of edges, such a pixel has neither the level of ink nor that of plate. Beside an edge, it
+    has the level of the other side: the edge is missing. The pose may be off by `slack_px`.
+
+    If more than half of all tested pixels show something else, the light or the pose is wrong
+    rather than the target hidden, and nothing is left out.
     """
     problem, sd_px, unblurred = seen.problem, seen.blur.largest_sd_px, seen.unblurred
     hidden = np.zeros(len(unblurred.rho_m), dtype=np.bool_)
@@ -254,19 +258,22 @@ def occluded_mask(seen: SeenPlate, light: Light, slack_px: float) -> BoolArray:
 
 
 def _without_dots(seen: SeenPlate, hidden: BoolArray) -> BoolArray:
-    """Unmark what may be a dot too many or too few: in the ring, and no larger than a dot.
+    """Unmark patches within the ring that are no larger than a dot.
 
-    Such a patch is evidence of another code. If it were masked, it would not count against the
-    target.
+    Such a patch may be an extra or a missing dot, which is evidence of another code. If it were
+    masked, it would not count against the target.
     """
     radii_m, rho_m, window = seen.problem.circles.radii_m, seen.unblurred.rho_m, seen.problem.window
     mask = hidden.reshape(window.height, window.width).view(np.uint8)
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(mask)
-    beside = (rho_m > radii_m[0]) | (rho_m < radii_m[1])
+    off_ring = (rho_m > radii_m[0]) | (rho_m < radii_m[1])
     dot_px = 2.0 * radii_m[2] / seen.metres_per_px
-    hides = np.bincount(labels.ravel(), weights=beside) > 0
+    hides = np.bincount(labels.ravel(), weights=off_ring) > 0
     hides |= boxes[:, cv2.CC_STAT_AREA] > _DOT_AREAS * 0.25 * math.pi * dot_px**2
-    hides |= boxes[:, cv2.CC_STAT_WIDTH : cv2.CC_STAT_HEIGHT + 1].max(axis=1) > _DOTS * dot_px + 1.0
+    hides |= (
+        boxes[:, cv2.CC_STAT_WIDTH : cv2.CC_STAT_HEIGHT + 1].max(axis=1)
+        > _DOT_LENGTHS * dot_px + 1.0
+    )
     hides[0] = False
     return np.asarray(hides[labels.ravel()])
 
@@ -286,9 +293,10 @@ def _mark_hidden(
 ) -> tuple[int, int]:
     """Mark pixels that are not what they should be; return how many, and how many were tested.
 
-    `share` is the white share without blur. A pixel is clear, and its level known to a quarter of
-    the contrast, from 2.6 σ on beside any edge. From 1.2 σ on blur has moved it by at most 12 % of
-    the contrast towards the other side: by half of the contrast only a missing edge does.
+    From 2.6 σ beside any edge on, a pixel is clear, and its level is known to a quarter of the
+    contrast. From 1.2 σ on, blur moves it by at most 12 % of the contrast towards the level of the
+    other side. If it is off by half of the contrast, the edge is missing. `share` is the white
+    share without blur.
     """
     hidden_count = tested_count = 0
     for i in range(len(smooth)):

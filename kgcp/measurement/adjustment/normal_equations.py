@@ -1,4 +1,4 @@
-"""The equations of one step of the adjustment: what is unknown, and how it is moved."""
+"""The unknowns of the adjustment, and the normal equations of one step."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.image_model.noise import Misfit
 from kgcp.measurement.image_model.photometry import PARAM_COUNT, SHAPE_PARAMS
 
-LIKE_A_TILT = 0.07
-"""Of the distance: a tilt of 1 rad is damped at least like such a change."""
+TILT_LIKE_DISTANCE = 0.07
+"""A tilt of 1 rad is damped at least like a change of the distance by this share."""
 
-_DEPTH, _FIRST_TURN, _LAST_TURN = 2, 3, 5  # among the parameters
+_DEPTH, _FIRST_TURN, _LAST_TURN = 2, 3, 5  # indices of parameters
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,7 +42,7 @@ class Unknowns:
         return _penalty(parameters.vector, self.mean, self.precision)
 
     def step_of(self, solution: FloatArray) -> FloatArray:
-        """Return the step (27,) by all parameters, of that by the estimated ones (p,)."""
+        """Return the step (27,) of all parameters, given that of the estimated ones (p,)."""
         step = np.zeros(PARAM_COUNT)
         step[self.free] = solution
         return step
@@ -58,9 +58,10 @@ def normal_matrix(scaled: FloatArray, current: Misfit, unknowns: Unknowns) -> Fl
 
 @summed
 def weighted_products(scaled: FloatArray, weight: FloatArray, precision: FloatArray) -> FloatArray:
-    """Return Σ weight · row · rowᵀ with the precision on the diagonal, two by two rows at a time.
+    """Return the products of all rows, weighted and summed over pixels, plus a diagonal precision.
 
-    It takes half the time of a general product, which computes both halves of a symmetric result.
+    Rows are taken two by two. That takes half the time of a general product, which computes both
+    halves of the symmetric result.
     """
     rows, pixels = scaled.shape
     normal, first, second = np.empty((rows, rows)), np.empty(pixels), np.empty(pixels)
@@ -137,17 +138,19 @@ class PlainEquations:
 
 
 def solve_damped(
-    damped: FloatArray, gradient: FloatArray, gain_besides: float = 0.0
+    damped: FloatArray, gradient: FloatArray, eliminated_gain: float = 0.0
 ) -> tuple[FloatArray, float]:
-    """Return the solution of symmetric equations, and the gain that it promises.
+    """Return the solution of symmetric equations, and the gain in log-likelihood that it promises.
+
+    `eliminated_gain` is the gain of unknowns that were eliminated.
 
     Raises
     ------
     Rejection
         `POOR_FIT` if the equations cannot be solved.
     """
-    _, solution, failure = dposv(damped.T, gradient)  # LAPACK itself: they are small and many
-    promised = 0.5 * float(gradient @ solution) + gain_besides
+    _, solution, failure = dposv(damped.T, gradient)  # LAPACK directly: many small systems
+    promised = 0.5 * float(gradient @ solution) + eliminated_gain
     if failure or not math.isfinite(promised):
         raise Rejection(Reason.POOR_FIT, "singular normal equations")
     return solution, promised
@@ -165,14 +168,14 @@ def _damped_equations(
     precision: FloatArray,
     free: IndexArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the damped normal matrix (p, p), and the gradient (p,) with the pull of the priors.
+    """Return the damped normal matrix (p, p), and the gradient (p,) with the part of the priors.
 
-    The image of a plate seen from straight above hardly changes with its tilt. Unless the tilt is
-    damped like the distance, every step turns the plate over and fails, and the distance never
-    changes.
+    The image of a plate that is seen frontally hardly changes with its tilt. If the tilt were not
+    damped like the distance, every step would turn the plate over and fail, and the distance would
+    never change.
     """
     damped, gradient = normal.copy(), scaled @ score
-    reach_m = LIKE_A_TILT * math.sqrt((translation_m**2).sum())
+    reach_m = TILT_LIKE_DISTANCE * math.sqrt((translation_m**2).sum())
     for k in range(len(free)):
         row, stiffness = free[k], normal[k, k]
         if _FIRST_TURN <= row <= _LAST_TURN:

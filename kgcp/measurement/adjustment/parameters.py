@@ -1,4 +1,4 @@
-"""Everything that the adjustment estimates, and how a step moves it."""
+"""The parameters that the adjustment estimates, and how a step changes them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Parameters:
 
     matrix: FloatArray  # (3, 4): of the pose: rotation and translation [m], target → camera
     vector: FloatArray  # (27,): all others in the order of `Param`, with zeros for the pose
-    field: LightField | None = None  # of light that is not the same everywhere
+    field: LightField | None = None  # levels that vary; None: even light
 
     @staticmethod
     def of(pose: Pose, blur: Blur, light: Light) -> Parameters:
@@ -83,7 +83,7 @@ class Parameters:
     def moved(self, step: FloatArray) -> Parameters:
         """Return the parameters after a step (27,) in the order of `Param`.
 
-        That of the pose is a translation [m] and a left rotation vector [rad].
+        Its part of the pose is a translation [m] and a left rotation vector [rad].
         """
         matrix = rotation_about(step[3:6]) @ self.matrix
         matrix[:, 3] = self.matrix[:, 3] + step[:3]
@@ -92,10 +92,10 @@ class Parameters:
 
 @compiled
 def _moved_others(vector: FloatArray, step: FloatArray) -> FloatArray:
-    """Return blur and light after a step, the blur such that it can be."""
+    """Return blur and light after a step, with the blur kept within what is possible."""
     moved = vector.copy()
     moved[_MEAN:] += step[_MEAN:]
-    if step[_MEAN] < 0.0:  # what steps promise of narrower blur is too much
+    if step[_MEAN] < 0.0:  # steps towards a narrower blur go too far
         moved[_MEAN] = vector[_MEAN] ** 2 / (vector[_MEAN] - step[_MEAN])
     moved[_MEAN] = max(moved[_MEAN], _MIN_VARIANCE_PX2)
     elongation = math.sqrt(moved[_DIFFERENCE] ** 2 + moved[_XY] ** 2)

@@ -35,14 +35,14 @@ from kgcp.measurement.image_model.photometry import (
 )
 from kgcp.measurement.image_model.sharpening import unsharp_mask
 
-_BORDER_SIGMAS, _BORDER_PX = 2.5, 0.8  # how far beyond the outer circle plate is needed …
-_BORDER_RADII = 0.2  # … and how far it is looked for at most
+_BORDER_SIGMAS, _BORDER_PX = 2.5, 0.8  # width of the border beyond the outer circle that is used
+_BORDER_RADII = 0.2  # its largest width
 _NEAR_PX = 0.3  # added to half the width of the band around an edge that is used
 _PLATEAU_PIXELS = 400  # enough for the levels and their noise
 NEAR_SIGMAS = 2.0
 """Half the width of the band around an edge that is used, in σ of the blur; see `select_pixels`."""
-_SMALL_PX = 40.0  # radius below which sharpening feels the far tails of edges
-_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)  # its multiples are spread evenly
+_SMALL_PX = 40.0  # radius below which sharpening depends on the far tails of edges
+_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)  # its multiples, modulo 1, are spread evenly
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,14 +79,15 @@ def select_pixels(
     near_sigmas: float = NEAR_SIGMAS,
     plateau_pixels: int = _PLATEAU_PIXELS,
 ) -> Sample:
-    """Choose pixels near edges and a share of the plateaus, at most `max_pixels` of both.
+    """Choose pixels near edges and some of the plateaus, at most `max_pixels` of both.
 
-    Pixels that blur may mix with what is foreign are not used: surroundings of the plate,
-    and what hides a part of the target. It is seen from the levels, once they are known (`light`),
-    by a pose that may be off by `slack_px`.
+    Pixels are not used if blur may have mixed them with the surroundings of the plate, or with
+    something that hides a part of the target. Both masks need the levels (`light`); without these,
+    neither is made. The pose may be off by `slack_px`.
 
-    Pixels in the far tails of an edge say little about it but cost as much as any other, and they
-    feel first what the model does not know; they are left out, beyond `near_sigmas` of the blur.
+    Pixels beyond `near_sigmas` of the blur from an edge are left out. In the far tails of an edge
+    they say little about it but cost as much as any other, and they are the first to show effects
+    that are not modelled.
 
     Raises
     ------
@@ -115,7 +116,7 @@ def select_pixels(
 def whole_plate(problem: FitProblem, pose: Pose, blur: Blur, light: Light) -> Sample:
     """Return all pixels of the ring and its border, hidden ones too, for pictures of residuals.
 
-    Those that blur mixes with the surroundings of the plate are left out, where that shows whatever
+    Left out are only pixels that blur certainly mixes with the surroundings of the plate, whatever
     the pose.
     """
     seen = see_plate(problem, pose, blur)
@@ -134,7 +135,7 @@ def _sample(
     is_thinned: bool,
     is_sparse: bool,
 ) -> Sample:
-    """Collect pixels; `is_sparse` says that some beside edges are not among them."""
+    """Collect pixels; `is_sparse` says that some of those beside edges are left out."""
     problem = seen.problem
     window, clip = problem.window, problem.censoring
     rays, pixels = np.take(window.rays, index, axis=1), window.pixels(index)
@@ -152,7 +153,7 @@ def _sample(
 
 
 def _sectors_about_normal(points_m: FloatArray, count: int) -> IndexArray:
-    """Return in which of `count` equal sectors about the plate's normal points (2, n) lie."""
+    """Return the number (n,) of the equal sector about the normal that each point (2, n) is in."""
     turns = np.arctan2(points_m[1], points_m[0]) / (2.0 * math.pi)
     return np.asarray(np.rint(turns * count).astype(np.intp) % count)
 
@@ -160,9 +161,9 @@ def _sectors_about_normal(points_m: FloatArray, count: int) -> IndexArray:
 def _useful_pixels(
     seen: SeenPlate, unused: BoolArray, near_sigmas: float, plateau_pixels: int
 ) -> IndexArray:
-    """Return the pixels near edges and some of the plateaus', without those of `unused`.
+    """Return the pixels near edges and some of the plateaus, without the `unused` ones.
 
-    None is used within circles that are not measured.
+    Pixels of plateaus are used only where no circle reaches that is not measured.
     """
     problem, sd_px, scale = seen.problem, seen.blur.largest_sd_px, seen.metres_per_px
     tail_m = REACH_SIGMAS * sd_px * scale
@@ -184,7 +185,7 @@ def _useful_pixels(
 
 
 def _unmeasured_m(seen: SeenPlate) -> float:
-    """Return how far from the target's centre the edges of what is not measured are felt."""
+    """Return how far from the target's centre the blurred edges of unmeasured circles reach."""
     problem = seen.problem
     radii_m = problem.circles.radii_m[problem.measured_count :]
     reach_m = reach_px(seen.blur) * seen.metres_per_px
@@ -203,7 +204,7 @@ def _fill_in_pixels(
     plateau_pixels: int,
     index: IndexArray,
 ) -> int:
-    """Fill in all pixels near edges, and a share of those clear of all edges; return how many."""
+    """Fill in all pixels near edges, and some of those clear of all edges; return how many."""
     flat = 0
     for i in range(len(rho_m)):
         is_flat = off_edge_m[i] >= tail_m and unmeasured_m <= rho_m[i] < limit_m
@@ -243,9 +244,10 @@ def _photometric_model(
 
 
 def _white_share_shown(seen: SeenPlate, pose: Pose, light: Light, index: IndexArray) -> FloatArray:
-    """Return the levels of all pixels but those of `index` as shares between ink and plate.
+    """Return the white shares that sharpening assumes for pixels that are not adjusted.
 
-    They are those under this pose, blur and light, which sharpening takes them for.
+    They are the modelled levels under this pose, blur and light, as shares between ink and plate.
+    Pixels of `index`, which are adjusted, have their share without blur.
     """
     problem, scale, shown = seen.problem, seen.metres_per_px, seen.unblurred.share.copy()
     is_other = seen.unblurred.off_edge_m < REACH_SIGMAS * seen.blur.largest_sd_px * scale
@@ -265,7 +267,7 @@ def _white_share_shown(seen: SeenPlate, pose: Pose, light: Light, index: IndexAr
 def _edge_incidence(
     seen: SeenPlate, pose: Pose, rays: FloatArray, index: IndexArray
 ) -> EdgeIncidence:
-    """Pair the pixels with the measured circles; the others are as they are for this pose."""
+    """Pair pixels with the measured circles; the other circles are fixed, as under this pose."""
     problem, blur, scale = seen.problem, seen.blur, seen.metres_per_px
     points_m = np.take(seen.unblurred.points_m, index, axis=1)
     measured = problem.circles.part(slice(0, problem.measured_count))

@@ -1,4 +1,4 @@
-"""How even the light is, from what is flat on the plate: ink and white clear of all edges."""
+"""Plateaus, ink and plate clear of all edges: how even the light is, and whether white is burnt."""
 
 from __future__ import annotations
 
@@ -16,52 +16,57 @@ from kgcp.measurement.image_model.photometry import Light, decoded
 from kgcp.measurement.image_model.seen_shadows import FlatPixels, SeenShadows, find_shadows
 from kgcp.measurement.image_model.unblurred import UnblurredPlate, unblurred_plate
 
-# Tuning, by the flights `light` of `benchmarks.accuracy.evaluate`; lengths in radii, light in
-# contrasts, where nothing else is said.
-_CLEAR_SIGMAS, _CLEAR_PX, _MOST_CLEAR = 2.0, 1.0, 0.1  # of an edge
-_BORDER = 0.18  # of the plate beyond the ring
-_SMOOTHED = 0.16
-_BINS = 4.0  # in the σ of a smoothing
-_WIDE, _WIDE_SHARE = 3.0, 0.02  # where nothing flat is near, what is farther off counts
-_UNEVEN = 0.12  # smoothed levels vary so much: one pair of them would mislead
+# Tuning, by the flights `light` of `benchmarks.accuracy.evaluate`. Where nothing else is said,
+# lengths are in radii of the ring, and light is in contrasts.
+_CLEAR_SIGMAS, _CLEAR_PX, _MOST_CLEAR = 2.0, 1.0, 0.1  # distance from an edge; at most in radii
+_BORDER = 0.18  # width of the plate beyond the ring
+_SMOOTHED = 0.16  # σ that levels are smoothed with
+_BINS_PER_SIGMA = 4.0  # of a wide smoothing
+# Where no plateau is near, one farther off counts: by a wider smoothing, with a small weight
+_WIDE, _WIDE_SHARE = 3.0, 0.02
+_UNEVEN = 0.12  # if smoothed levels vary by more, one pair of levels would mislead
+# Plate around that is so much brighter than its median is under glare; plate is at least so far
+# above the ink's level, and ink so far below the plate's around it.
 _GLARE, _DARKEST_PLATE, _DARKER_INK = 0.06, 0.35, 0.5
-_GLARE_REACH, _SEEN = 1.5, 1e-3
+_GLARE_REACH, _LEAST_WEIGHT = 1.5, 1e-3  # in smoothings; weight of plate that is near enough
 _LEAST_CONTRAST = 0.1
 _FEWEST_PIXELS = 24  # of ink and of plate
-_MOST_PIXELS = 4000  # that tell where edges of shadows lie
-# Grey value of white that may be burnt below the end of the range, and from where on up to there
-# what is seen is its edge. With 0.7 or 0.85 of the contrast instead of 0.8, errors of three sets of
-# phones' burnt plates (R 37 to 140 px) are 0.8 to 2.2 times as large.
+_MOST_PIXELS = 4000  # in which edges of shadows are looked for
+# White between these shares of the range may be burnt below its end. What is brighter than this
+# share of the contrast is then taken for the edge of burnt white. With 0.7 or 0.85 instead of 0.8,
+# errors of three sets of phones' burnt plates (R 37 to 140 px) are 0.8 to 2.2 times as large.
 _BURNT_WHITE, _EDGE_OF_BURNT = (0.8, 0.985), 0.8
-_LIT = 0.1  # of the contrast: so near the brightest plate, it is in full light
-# Noise of burnt white in grey values, and as a share of that of ink, at most; the second pair is
-# for ink that compression has smoothed. Of 288 plates by phones that are not burnt (R 37 to 290 px;
-# PNG, quality 95 and 92), none is taken for burnt. Of 48 burnt ones with R ≥ 150 px, 47 are; of 16
-# smaller ones with quality 92 only 6, for what compression leaves beside edges looks like noise.
+_LIT = 0.1  # plate that is so near the brightest plate is in full light
+# Largest noise of burnt white, in grey values and as a share of the noise of ink. The second pair
+# is for ink that compression has smoothed. Of 288 simulated plates by phones that are not burnt (R
+# 37 to 290 px; PNG, JPEG quality 95 and 92), none is taken for burnt. Of 48 burnt ones with R ≥ 150
+# px, 47 are. Of 16 smaller burnt ones with quality 92 only 6 are, as what compression leaves beside
+# edges looks like noise.
 _NOISE_OF_BURNT = ((0.27, 0.4), (0.145, 0.7))
-_CENTRAL, _CENTRAL_SD = 0.7, 0.557  # share of the smallest values; their RMS if normal
-# The second difference both ways: light that changes steadily does not show in it.
-_ROUGHNESS = np.outer((1.0, -2.0, 1.0), (1.0, -2.0, 1.0)) / 6.0
+_CENTRAL, _CENTRAL_SD = 0.7, 0.557  # share of the smallest values, and their RMS if normal
+# Second difference along both axes, scaled to the noise of a pixel: it is 0 for light that changes
+# steadily.
+_SECOND_DIFFERENCE = np.outer((1.0, -2.0, 1.0), (1.0, -2.0, 1.0)) / 6.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plateaus:
-    """Levels of ink and plate all over a window, from where they are seen."""
+    """Levels of ink and plate all over a window, from the pixels that show them."""
 
     levels: FloatArray  # (2, n): of ink and of plate, at every pixel
     typical: tuple[float, float]  # medians
     extremes: tuple[float, float]  # the darkest ink and the brightest plate, smoothed
-    uneven: float  # how much they vary, of the contrast
+    variation: float  # of the levels, as a share of the contrast
     flat: tuple[IndexArray, IndexArray]  # pixels of ink and plate clear of edges
 
     @property
     def is_uneven(self) -> bool:
         """Whether the levels vary so much that one pair of them would mislead."""
-        return self.uneven > _UNEVEN
+        return self.variation > _UNEVEN
 
 
 def look_at_plateaus(problem: FitProblem, pose: Pose, sd_px: float) -> Plateaus | None:
-    """Smooth ink and plate each over what is seen of them; None if too little is."""
+    """Find the plateaus, smoothed over the window; None if too little of them is seen."""
     window = problem.window
     unblurred = unblurred_plate(problem.circles, problem.measured_count, pose, window.rays)
     clear = _clear_of_edges(problem, unblurred, sd_px)
@@ -78,7 +83,7 @@ def look_at_plateaus(problem: FitProblem, pose: Pose, sd_px: float) -> Plateaus 
         levels=levels,
         typical=(black, white),
         extremes=(darkest, brightest),
-        uneven=max(dark - darkest, brightest - bright) / (white - black),
+        variation=max(dark - darkest, brightest - bright) / (white - black),
         flat=(ink, plate),
     )
 
@@ -86,9 +91,10 @@ def look_at_plateaus(problem: FitProblem, pose: Pose, sd_px: float) -> Plateaus 
 def without_burnt_white(problem: FitProblem, plateaus: Plateaus) -> FitProblem:
     """Return the problem with white taken for clipped, if it is burnt below the end of the range.
 
-    Cameras that map tones locally, or to another exposure, do so after the sensor has clipped.
-    The plate is brighter there than it seems, and its edges are displaced by a curve that no three
-    shapes follow. What gives burnt white away is its noise, less than rounding alone makes.
+    Cameras that map tones locally, or to another exposure, do so after the sensor has clipped. The
+    plate is brighter than it seems then, and the curve that displaces its edges has a corner that
+    three shapes cannot follow. Burnt white is recognised by its noise, which is less than rounding
+    alone makes.
     """
     shows_noise = problem.window.binning == 1 and not problem.is_ring_small
     ink, plate = plateaus.typical[0], plateaus.extremes[1]
@@ -109,7 +115,9 @@ def _noise_in_counts(problem: FitProblem, flat: IndexArray) -> float:
     """Return the standard deviation of the noise at some pixels, robust against edges nearby."""
     window = problem.window
     image = (window.levels / window.levels_per_count).reshape(window.height, window.width)
-    rough = cv2.filter2D(image, -1, _ROUGHNESS, borderType=cv2.BORDER_REPLICATE).ravel()[flat]
+    rough = cv2.filter2D(image, -1, _SECOND_DIFFERENCE, borderType=cv2.BORDER_REPLICATE).ravel()[
+        flat
+    ]
     count = max(1, int(_CENTRAL * len(rough)))
     central = np.partition(rough * rough, count - 1)[:count]
     return math.sqrt(float(central.mean())) / _CENTRAL_SD
@@ -129,10 +137,10 @@ def _clear_of_edges(problem: FitProblem, unblurred: UnblurredPlate, sd_px: float
 def _kinds(
     problem: FitProblem, unblurred: UnblurredPlate, clear: BoolArray
 ) -> tuple[BoolArray, BoolArray]:
-    """Tell what is ink and what is plate.
+    """Tell which clear pixels (n,) show ink, and which plate.
 
-    Ink as bright as plate is a dot of another code, and so is dark plate: neither may pass for
-    light. Glare makes ink brighter, but the plate around it, too.
+    Ink as bright as plate, or plate as dark as ink, is evidence of another code, and must not pass
+    for uneven light. Glare makes ink brighter, but the plate around it, too.
     """
     values = problem.window.smooth
     is_ink, is_plate = clear & (unblurred.share < 0.5), clear & (unblurred.share > 0.5)
@@ -153,7 +161,7 @@ def _plate_around(problem: FitProblem, is_plate: BoolArray) -> FloatArray:
     near, total = (
         _blurred(problem, values, sigma_px) for values in (weight, weight * problem.window.smooth)
     )
-    return np.where(near > _SEEN, total / np.maximum(near, _SEEN), 0.0)
+    return np.where(near > _LEAST_WEIGHT, total / np.maximum(near, _LEAST_WEIGHT), 0.0)
 
 
 def _smoothed_over(problem: FitProblem, flat: IndexArray) -> FloatArray:
@@ -172,15 +180,15 @@ def _smoothing_px(problem: FitProblem) -> float:
 
 
 def _blurred(problem: FitProblem, values: FloatArray, sigma_px: float) -> FloatArray:
-    """Blur a window's values; where that is wide, in bins of a quarter of its σ."""
+    """Blur a window's values; if σ is large, in bins of a quarter of it."""
     image = values.reshape(problem.window.height, problem.window.width)
-    count = max(1, int(sigma_px / _BINS))  # pixels along a bin's side
+    count = max(1, int(sigma_px / _BINS_PER_SIGMA))  # pixels along a bin's side
     if count == 1:
         blurred = cv2.GaussianBlur(image, (0, 0), sigma_px)
     else:
         size = [math.ceil(length / count) for length in image.shape[::-1]]
         bins = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        # means over bins, and straight lines between them, blur too
+        # averaging over bins (1/12), and interpolating between them (1/6), blur, too
         sigma = math.sqrt((sigma_px / count) ** 2 - 1.0 / 12.0 - 1.0 / 6.0)
         bins = cv2.GaussianBlur(bins, (0, 0), sigma)
         blurred = cv2.resize(bins, image.shape[::-1], interpolation=cv2.INTER_LINEAR)
@@ -188,7 +196,7 @@ def _blurred(problem: FitProblem, values: FloatArray, sigma_px: float) -> FloatA
 
 
 def evened_window(problem: FitProblem, plateaus: Plateaus) -> FitProblem:
-    """Return the window as it would be in even light, by the levels seen."""
+    """Return the problem with the window as it would be in even light, by the levels seen."""
     window = problem.window
     (black, white), (ink, plate) = plateaus.typical, plateaus.levels
     contrast = np.maximum(plate - ink, _LEAST_CONTRAST * (white - black))
@@ -201,7 +209,7 @@ def evened_window(problem: FitProblem, plateaus: Plateaus) -> FitProblem:
 def field_of(
     field: LightField, problem: FitProblem, plateaus: Plateaus, light: Light
 ) -> LightField:
-    """Return a field whose finest knots have the levels seen."""
+    """Return the field with the levels seen as the values of its finest knots."""
     window, finest = problem.window, len(field.knots.spacings_px) - 1
     x, y = np.rint(field.knots.places_px(finest)).astype(np.intp)
     columns = np.clip(x - window.x0, 0, window.width - 1)

@@ -1,4 +1,4 @@
-"""What is known of the imaging, and of the plate, before the adjustment."""
+"""What the adjustment is given: a window, the circles of the plate, and how grey values arise."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from kgcp.measurement.image_model.window import Window
 from kgcp.targets.layout import Ring
 
 SMALL_RING_PX = 12.5
-"""Radius below which rings hardly show ink and plate beside their edges."""
-_CLIPPED = 0.002  # share of a window's pixels from which on clipping shows in bins
-_FEW_PIXELS = 400  # enough to come near the minimum, at a fraction of the time
-# Radius from which on rings show what compression makes of a stated curve. If that may bend, errors
-# of 100 rings in JPEGs fall from 0.0042 to 0.0036 px at R 26 to 40 px, and from 0.0035 to 0.0022 px
-# at R 40 to 110 px; without compression they stay as they are. Smaller rings gain little, and their
-# errors grow by some 15 % where nothing is compressed.
-_BENDING_PX = 26.0
+"""Radius below which rings hardly show ink and plate clear of edges."""
+_CLIPPED = 0.002  # largest share of clipped pixels that bins need no tone for
+_FEW_PIXELS = 400  # enough to come near the minimum, in a fraction of the time
+# From this radius on, a stated sRGB curve may bend a little, since compression changes the shape of
+# edges. In simulated JPEGs that reduces the errors of 100 rings from 0.0042 to 0.0036 px at R 26 to
+# 40 px, and from 0.0035 to 0.0022 px at R 40 to 110 px; without compression they stay as they are.
+# Smaller rings gain little, and their errors grow by some 15 % where nothing is compressed.
+_BENT_SRGB_FROM_PX = 26.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FitProblem:
-    """A window with a target in it, and what it is seen with."""
+    """A window with a target in it, and all that is known of its imaging."""
 
     window: Window
-    ring: Ring  # the target's own, of which the code must be seen
+    ring: Ring  # the target's main ring, whose code must be seen
     circles: Circles  # all circles of the plate
-    # the first so many of them are measured; of the others only what they add there is modelled
+    # the first so many circles are measured; the others are only modelled, as under the start pose
     measured_count: int
     # of the ring that is measured
     outer_radius_m: float
@@ -44,13 +44,13 @@ class FitProblem:
     censoring: Censoring  # of the whole window
     tone: Tone
     sharpening_px: float  # σ of the unsharp mask to be modelled [px]; 0: none
-    # what is known of the rotation is taken out of the window's rays; None: a global shutter
+    # the known part of the rotation is already taken out of the window's rays; None: global shutter
     shutter: RollingShutter | None = None
     # (m,): where the target is seen, in equal steps about its normal from its +x axis on; None:
     # everywhere, as far as the search knows
     visible: BoolArray | None = None
-    most_pixels: int | None = None  # that take part; None: all that are useful
-    # whether bins that need levels that vary are to end in `UnevenLightInBins`
+    most_pixels: int | None = None  # that are adjusted; None: all that are useful
+    # whether to raise `UnevenLightInBins` if the light on bins is uneven
     may_be_finer: bool = False
     # grey value that burnt white has below the end of the range; None: it is seen clipped
     burnt_white: float | None = None
@@ -63,7 +63,7 @@ class FitProblem:
     def with_burnt_white(self, white: float, limit: float) -> FitProblem:
         """Return the problem with a burnt white below the end of the range.
 
-        What is seen above `limit` counts as clipped, with the edge of that white.
+        Grey values above `limit`, the edge of that white, count as clipped.
         """
         levels = self.window.levels
         return replace(
@@ -77,21 +77,23 @@ class FitProblem:
 
     @property
     def is_ring_small(self) -> bool:
-        """Whether the ring hardly shows ink and plate beside its edges."""
+        """Whether the ring hardly shows ink and plate clear of edges."""
         return self.outer_radius_px < SMALL_RING_PX
 
     @property
     def few_pixels(self) -> int | None:
-        """How many pixels a first approach needs; None: all, for an unsharp mask needs them."""
+        """How many pixels a rough fit needs; None: all, since an unsharp mask needs them."""
         return None if self.sharpening_px else _FEW_PIXELS
 
 
 def apparent_tone(response: Response, window: Window, radius_px: float) -> Tone:
     """Return how the grey values of a window follow light.
 
-    Where JPEG leaves out what it takes for noise, an edge is no longer quite what sRGB's curve
-    makes of it: that is allowed for. In means of grey values, tone curves, sharpening and clipping
-    leave of an edge within a bin how far they displace it; the tone's parameters take that.
+    JPEG leaves out what it takes for noise, so that an edge is no longer quite what sRGB's curve
+    makes of it. Larger rings show that: their curve may bend a little.
+
+    Bins are means of grey values. If an edge lies within a bin, all that tone curve, sharpening and
+    clipping leave of it is how far they displace it. One parameter of the tone takes that.
 
     Parameters
     ----------
@@ -99,7 +101,7 @@ def apparent_tone(response: Response, window: Window, radius_px: float) -> Tone:
         Of the ring.
     """
     if window.clipped is None:
-        if response is Response.SRGB and radius_px >= _BENDING_PX:
+        if response is Response.SRGB and radius_px >= _BENT_SRGB_FROM_PX:
             return Tone.NEAR_SRGB
         return Tone.of(response)
     is_clipped = float(np.mean(window.clipped)) > _CLIPPED

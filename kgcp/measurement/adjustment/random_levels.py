@@ -1,6 +1,6 @@
 """Levels of ink and plate that vary over the plate, adjusted with pose, blur and light.
 
-They are random effects: values at knots with a prior of zero mean, of which the variance comes from
+They are random effects: values at knots, with a prior of zero mean whose variance is estimated from
 the frame itself. docs/method.md, "Light that is not the same everywhere", says why.
 """
 
@@ -24,7 +24,7 @@ from kgcp.measurement.adjustment.level_equations import (
     gather,
 )
 from kgcp.measurement.adjustment.normal_equations import (
-    LIKE_A_TILT,
+    TILT_LIKE_DISTANCE,
     Unknowns,
     normal_matrix,
     scaled_rows,
@@ -58,52 +58,58 @@ from kgcp.measurement.image_model.photometry import (
 )
 from kgcp.measurement.image_model.shadow_edges import NO_EDGES
 
-# Tuning of the levels, by the light flights of `benchmarks.accuracy.evaluate`. Fits that are
-# continued from their end, by three phases more, move by 0.05 σ of the distance or less (RMS; in
-# dirt, under highlights and in mixtures), under shadows by 0.1 σ.
+# Tuning of the levels, by the light flights of `benchmarks.accuracy.evaluate`. The number of phases
+# is enough: three more phases move the distance by 0.05 σ or less in dirt, under highlights and in
+# mixtures, and by 0.1 σ under shadows (RMS).
 _ROUNDS, _PHASES, _STEPS = 2, 3, 8
-_ALL_BUT_ZERO = 1e-6  # a parameter of which derivatives are asked for
-_LEAST_GAIN = 0.05  # of log-likelihood
-# If the other pose is worse by so much log-likelihood after two steps, it stays the worse one: of
-# 240, the 90 that were ended worse by 4300 or more. One that was worse by 1600 became the better.
-# One that is worse by 15,000 before the first step need not be fitted: of 178, the 60 that were
-# ended worse by 4300 or more, after all their steps.
+_ALL_BUT_ZERO = 1e-6  # start of a parameter whose derivatives are needed: at 0 they are left out
+_LEAST_GAIN = 0.05  # in log-likelihood: a step that gains less is the last
+# Log-likelihood by which the other pose is so much worse that its fit is given up. After two steps:
+# of 240 fits, 90 are worse by so much, and all of these ended worse by 4300 or more after all their
+# steps; one that was worse by 1600 became the better one. Before the first step: of 178 fits, 60
+# are worse by so much, and these too ended worse by 4300 or more.
 _HOPELESS, _HOPELESS_AT_ONCE = 5000.0, 15000.0
-# Promise from which on the Jacobian is computed anew, in log-likelihood. Levels and tone curve do
-# nearly the same, so that a Jacobian that is off by some per cent promises what no step can gain:
-# steps went on with a tenth of what they promised, until their number was used up.
+# If a step promises a larger gain in log-likelihood, the Jacobian is computed anew after it. Levels
+# and tone curve have nearly the same effect, so that a Jacobian that is off by some per cent
+# promises gains that no step can make: steps gained a tenth of what they promised, until their
+# number was used up.
 _LARGE_GAIN = 1.0
-_SETTLED_PX = 0.1
-_LEAST_SD, _MOST_SD, _FIRST_SD = 1e-4, 1.0, 0.1  # of the levels' prior, of the contrast
-_FINEST_PX, _FINE, _COARSE = 8.0, 6.0, 0.8  # knots: px, per radius, and radii apart
+_SETTLED_PX = 0.1  # a round that moves the target less is the last
+_LEAST_SD, _MOST_SD, _FIRST_SD = 1e-4, 1.0, 0.1  # of the levels' prior, as shares of the contrast
+# Knots of the fine grid: least spacing [px], and how many per radius; spacing of the coarse grid in
+# radii
+_FINEST_PX, _FINE, _COARSE = 8.0, 6.0, 0.8
 _SLACK_PX = 0.4
 _PLATEAU_PIXELS = 1200
-# Half width of the band around an edge that is used, in σ of its blur, on rings from this radius
-# on, four knots of the finest grid. With the pixels just beside edges left out, nothing ties the
-# levels at an edge to those of the plateaus: errors of three flights of phones, R ≥ 26 px, were 1.4
-# to 1.8 times as large. Smaller rings hardly have pixels so far from all edges, and under
-# highlights their errors grew.
+# On rings from this radius on (four knots of the finest grid), a wider band around edges is used;
+# its half width is in σ of the blur. If the pixels just beside edges are left out, nothing ties the
+# levels at an edge to those of the plateaus: errors in three flights of phones, R ≥ 26 px, were 1.4
+# to 1.8 times as large. Smaller rings hardly have pixels so far from all edges, and with the wider
+# band their errors under highlights grew.
 _NEAR_SIGMAS, _NEAR_FROM_PX = 3.3, 4.0 * _FINEST_PX
 _LEAST_CONTRAST = 0.05
-# Mean square of the residuals' sums over cells, relative to that of independent residuals. Above
-# this, the levels vary; frames in even light have about 1. Bins have little noise: 19 rings of R
-# 150 to 310 px in even light had 0.9 to 5.6, and 30 in uneven light 6.4 (one) and 25 to 60.
+# The excess is the mean square of the residuals' sums over cells, relative to that of independent
+# residuals. If it is larger than this, the levels vary; in even light it is about 1. Bins have
+# little noise and a limit of their own: of rings of R 150 to 310 px, 19 in even light had 0.9 to
+# 5.6; of 30 in uneven light, one had 6.4 and the others 25 to 60.
 _UNEVEN_EXCESS, _UNEVEN_EXCESS_OF_BINS = 1.9, 3.0
-# In small rings, cells say less than edges do. An excess that leaves a doubt is enough if residuals
-# that agree along edges inflate the covariance so much: of 58 frames with dirt, one of R 15 px had
-# an excess of 1.3, an inflation of 6.5, and an error of 4.6 σ without levels that vary. In even
-# light, with an excess above 1.2, the largest inflation is 3.5 (the flight of a coarse renderer).
-# Rings below `SMALL_RING_PX` hardly fill a cell, and white that is burnt does not vary. Two under
-# highlights, 5 and 6 σ off in even light, had excesses of 0.6 and 0.8 and inflations of 1.8 and
-# 2.2; two that were burnt and half in shade, 7 σ off, 0.3 and 0.4, and 3.3 and 2.7. So inflation is
-# enough there: levels that vary must be likelier besides. In even light, of 159 such rings that are
-# burnt, two are refused for it.
-_DOUBTFUL, _DOUBTFUL_IN_SMALL_RING = (1.2, 4.0), 1.6
-_TELLING_POWER = 0.05  # of the cell that tells most
+# In small rings, edges tell more of uneven light than cells do. So levels also vary if the excess
+# is above the first limit and residuals that agree along edges inflate the covariance by more than
+# the second. Of 58 simulated frames with dirt, one with R 15 px had an excess of 1.3, an inflation
+# of 6.5, and an error of 4.6 σ without levels that vary. In even light, fits with an excess above
+# 1.2 have an inflation of at most 3.5 (in the flight of a coarse renderer).
+#
+# Rings below `SMALL_RING_PX` hardly fill a cell, and burnt white does not vary. So there the
+# inflation alone decides, and levels that vary must be likelier besides. Two rings under
+# highlights, 5 and 6 σ off with even light, had excesses of 0.6 and 0.8 and inflations of 1.8 and
+# 2.2. Two that were burnt and half in shade, 7 σ off, had excesses of 0.3 and 0.4 and inflations of
+# 3.3 and 2.7. The price: of 159 such rings that are burnt in even light, two are refused.
+_DOUBTFUL, _DOUBTFUL_INFLATION_OF_SMALL_RING = (1.2, 4.0), 1.6
+_TELLING_POWER = 0.05  # cells with less weight, relative to the largest, are left out
 
 
 def even_field(problem: FitProblem) -> LightField:
-    """Return a field that adds nothing yet: a fine grid, and a coarse one if that is coarser."""
+    """Return a field of zeros on a fine grid, and on a coarse one if that is clearly coarser."""
     radius, window = problem.outer_radius_px, problem.window
     fine, coarse = max(_FINEST_PX, radius / _FINE), _COARSE * radius
     spacings_px = (coarse, fine) if coarse > 1.5 * fine else (fine,)
@@ -141,14 +147,14 @@ def excess_of_cells(fit: TargetFit) -> float:
 
 
 def needs_varying_levels(fit: TargetFit) -> bool:
-    """Tell whether residuals agree within the cells of the finest grid, or along edges."""
+    """Tell whether levels vary: residuals agree within cells of the finest grid, or along edges."""
     excess, is_binned = excess_of_cells(fit), fit.sample.problem.window.binning > 1
     if excess > (_UNEVEN_EXCESS_OF_BINS if is_binned else _UNEVEN_EXCESS):
         return True
     if is_binned:
         return False
     if fit.sample.problem.is_ring_small:
-        return pose_covariance(fit).inflation > _DOUBTFUL_IN_SMALL_RING
+        return pose_covariance(fit).inflation > _DOUBTFUL_INFLATION_OF_SMALL_RING
     doubtful, inflation = _DOUBTFUL
     return excess > doubtful and pose_covariance(fit).inflation > inflation
 
@@ -168,7 +174,7 @@ def fit_levels(problem: FitProblem, starts: list[Parameters], unknowns: Unknowns
 
 
 def fit_other_pose(first: TargetFit, other: Pose) -> tuple[TargetFit, TargetFit]:
-    """Adjust another pose from the levels, on the pixels and with the noise of a fit.
+    """Adjust another pose, from the levels of a fit, on its pixels and with its noise.
 
     Returns
     -------
@@ -190,7 +196,7 @@ def fit_other_pose(first: TargetFit, other: Pose) -> tuple[TargetFit, TargetFit]
 
 
 def chi2_with_levels(fit: TargetFit, unknowns: Unknowns, param: Param) -> float:
-    """Return the χ² by which residuals of a fit with levels ask for one more parameter.
+    """Return the χ² of a score test for one more parameter in a fit with levels that vary.
 
     `unknowns` are those of the fit and the parameter, which is zero so far.
     """
@@ -207,7 +213,7 @@ def chi2_with_levels(fit: TargetFit, unknowns: Unknowns, param: Param) -> float:
 
 
 def _adjust_levels(problem: FitProblem, start: Parameters, unknowns: Unknowns) -> TargetFit:
-    """Adjust with a field of levels, in rounds with their own choice of pixels."""
+    """Adjust with a field of levels, in rounds that each choose their pixels."""
     parameters = start if start.field is not None else replace(start, field=even_field(problem))
     is_large = problem.outer_radius_px >= _NEAR_FROM_PX
     for _ in range(_ROUNDS):
@@ -229,7 +235,7 @@ def _adjust_levels(problem: FitProblem, start: Parameters, unknowns: Unknowns) -
 
 
 def _evened(problem: FitProblem, parameters: Parameters) -> FitProblem:
-    """Return a problem whose smooth image is what it would be in even light."""
+    """Return a problem whose smooth image, which masks are made from, is as in even light."""
     field, window = parameters.field, problem.window
     if field is None:
         return problem
@@ -244,7 +250,7 @@ def _evened(problem: FitProblem, parameters: Parameters) -> FitProblem:
 
 
 def _adjust_on(sample: Sample, parameters: Parameters, unknowns: Unknowns) -> TargetFit:
-    """Adjust on a sample; noise, and the prior of the levels, come from the phase before."""
+    """Adjust on a sample in phases; each takes noise and prior of the levels from the last."""
     field = _field_of(parameters)
     at_knots = AtKnots.of(*field.knots.weights(sample.pixels))
     linear = linearise(sample, parameters)
@@ -261,8 +267,8 @@ def _adjust_on(sample: Sample, parameters: Parameters, unknowns: Unknowns) -> Ta
 def _with_variances(fit: TargetFit) -> LightField:
     """Return the field with the prior estimated from its own values (MacKay's fixed point).
 
-    The variance of a group is Σ c² / γ, with γ the number of values that the pixels determine;
-    groups are the grids, of ink and of plate.
+    The variance of a group of values c is Σ c² / γ, where γ is the number of values that the pixels
+    determine. Each grid has a group for ink and one for plate.
     """
     field, equations = _field_of(fit.parameters), _equations_of(fit)
     grid = np.repeat(np.arange(len(field.knots.counts)), field.knots.counts)
@@ -285,7 +291,7 @@ def _minimise(
     linear: tuple[PredictedImage, FloatArray] | None = None,
     hopeless_total: float = math.inf,
 ) -> TargetFit:
-    """Minimise the negative log-likelihood with all priors; the fit has the equations, too."""
+    """Minimise the negative log-likelihood with all priors; the fit keeps its equations."""
     latest: _WithLevels | None = None
     latest_jacobian: FloatArray | None = None
 
@@ -307,13 +313,13 @@ def _minimise(
         hopeless_total=hopeless_total,
         equations_of=equations_of,
     )
-    if latest is None or latest_jacobian is not fit.jacobian:  # it has been computed again since
+    if latest is None or latest_jacobian is not fit.jacobian:  # computed again after the last step
         latest = equations_of(fit.parameters, fit.jacobian, fit.misfit)
     return replace(fit, level_equations=latest.reduced)
 
 
 def _field_of(parameters: Parameters) -> LightField:
-    """Return the field, which all parameters of this module have."""
+    """Return the field, which is never None in this module."""
     return cast("LightField", parameters.field)
 
 
@@ -355,12 +361,12 @@ class _WithLevels:
         """Return the parameters after a damped step, and the gain that the step promises."""
         reduced, unknowns, field = self.reduced, self.unknowns, _field_of(parameters)
         free = unknowns.free
-        of_levels = reduced.gradient_of_levels(current.score, field.values)
+        level_gradient = reduced.gradient_of_levels(current.score, field.values)
         pull = unknowns.precision[free] * (unknowns.mean[free] - parameters.vector[free])
-        of_offsets = -LEVEL_OFFSET_PRECISION * field.offsets
-        pulls = np.concatenate((pull, of_offsets, field.shadows.pull))
+        offset_pull = -LEVEL_OFFSET_PRECISION * field.offsets
+        pulls = np.concatenate((pull, offset_pull, field.shadows.pull))
         gradient = reduced.scaled @ current.score + pulls
-        alone = reduced.half_solved(of_levels)
+        alone = reduced.half_solved(level_gradient)
         gradient -= reduced.half_mixed.T @ alone
         damped = _damped(reduced.normal, parameters, damping)
         solution, promised = solve_damped(damped, gradient, 0.5 * float(alone @ alone))
@@ -378,8 +384,8 @@ class _WithLevels:
 
 
 def _damped(normal: FloatArray, parameters: Parameters, damping: float) -> FloatArray:
-    """Add to the diagonal; tilts are held back like the distance, as in `normal_equations`."""
+    """Damp a normal matrix; tilts are damped like the distance, as in `normal_equations`."""
     stiffness = np.diag(normal).copy()
-    reach_m = LIKE_A_TILT * float(np.linalg.norm(parameters.matrix[:, 3]))
+    reach_m = TILT_LIKE_DISTANCE * float(np.linalg.norm(parameters.matrix[:, 3]))
     stiffness[3:6] = np.maximum(stiffness[3:6], reach_m * reach_m * stiffness[2])
     return np.asarray(normal + np.diag(damping * stiffness))

@@ -38,12 +38,11 @@ class ResidualImage:
     # the first pixel's place in the frame [px]
     x0: int
     y0: int
-    # (height, width): model less grey value; NaN off the ring and its border, as far as that is
-    # plate
+    # (height, width): model minus grey value; NaN outside the ring and its border of plate
     share: FloatArray
-    edge_noise: float  # their median size near edges, without what lies hidden
-    # (height, width): where the light is uneven, the level of white that was fitted, in shares of
-    # its largest value on the plate; NaN where `share` is
+    edge_noise: float  # median residual near edges, without hidden pixels
+    # (height, width): the fitted level of white relative to its largest value on the plate; NaN
+    # where `share` is; None: the light is even
     white: FloatArray | None = None
 
 
@@ -52,8 +51,8 @@ def residual_image_of(
 ) -> ResidualImage:
     """Return the residuals of the grey values around a target at this pose.
 
-    Blur and light are adjusted; the pose is not, by whichever method it was measured. Uneven light
-    is that of a fit in which the pose is free.
+    Blur and light are adjusted; the pose is kept, whichever method it is from. Where the light is
+    uneven, it is taken from a fit with a free pose.
 
     Parameters
     ----------
@@ -71,18 +70,18 @@ def residual_image_of(
     """
     problem = fit_problem_of(grey, camera, target, pose)
     start = Parameters.of(pose, _blur_in_bins(blur_px, problem), first_levels(problem, pose))
-    fit = adjust_with_streak(problem, start, moves=False)
-    # whether the light varies is decided by the covariance of a pose, which must be free for that
+    fit = adjust_with_streak(problem, start, moves_pose=False)
+    # the test for uneven light needs the covariance of the pose: as if the pose were free
     if needs_varying_levels(replace(fit, unknowns=with_pose(fit.unknowns))):
         is_binned = problem.tone is Tone.OF_BINS
         if is_binned:  # as in a measurement
             problem = finer_problem_of(grey, camera, target, pose)
         blur = _blur_in_bins(blur_px, problem)
-        with contextlib.suppress(Rejection):  # a code that is not seen is what residuals show
+        with contextlib.suppress(Rejection):  # if the code is not seen, the residuals show it
             best = fit_in_any_light(problem, pose, blur).likelier.best
             is_even = best.parameters.field is None and best.sample.problem.burnt_white is None
             fit = fit if is_even and not is_binned else best
-    problem = fit.sample.problem  # which says over which curve an unknown tone was fitted
+    problem = fit.sample.problem  # its tone is the base that an unknown curve was fitted over
     binning = problem.window.binning
     parameters = fit.parameters.at(pose)
     light = parameters.light

@@ -1,10 +1,10 @@
-"""Smoothing along contours as one more unknown, linear since it is small.
+"""Smoothing along contours: an unknown that all measurements of a camera estimate together.
 
-It is estimated after all others, at their minimum, and kept with its effect on the pose, because
-all frames of a flight together determine it better: a camera smooths all of them nearly alike,
-apart from effects of light and focus. The values of frames scatter about a mean of the camera. Mean
-and scatter are estimated from all measurements (empirical Bayes); for a single measurement, they
-are those of cameras in general.
+It is small and acts linearly. So it is estimated after all other unknowns, at their minimum, and
+kept with its effect on the pose. A camera smooths all frames nearly alike, apart from effects of
+light and focus: the values of frames scatter about a mean of the camera. Mean and scatter are
+estimated from all measurements (empirical Bayes). For a single measurement, they are those of
+cameras in general.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from kgcp.measurement.image_model.edge_terms import smoothing_row
 from kgcp.measurement.image_model.ray_plate import views_of
 from kgcp.measurement.records import ContourSmoothing, Measurement
 
-# Of eight flights by other programs, smoothing had means of −0.07 to 0.09 px² with scatters of 0 to
-# 0.08 px² about them (docs/method.md, "What a flight shares").
+# In eight flights rendered by other programs, the smoothing had means of −0.07 to 0.09 px², with
+# scatters of 0 to 0.08 px² about them (docs/method.md, "What a flight shares").
 _SD_OF_CAMERAS_PX2, _SCATTER_PX2 = 0.1, 0.05
 _SCATTERS_PX2 = np.linspace(0.0, 4.0 * _SCATTER_PX2, 41)
 
@@ -34,8 +34,8 @@ _SCATTERS_PX2 = np.linspace(0.0, 4.0 * _SCATTER_PX2, 41)
 def contour_smoothing(fit: TargetFit, inflation: float) -> ContourSmoothing | None:
     """Return a fit's estimate of smoothing along contours; None if none is expected.
 
-    It is expected of cameras of unknown tone, which process their pictures. In bins no contour is
-    curved enough to show it.
+    Cameras of unknown tone process their pictures, and may smooth. In bins no contour is curved
+    enough to show it.
 
     Parameters
     ----------
@@ -79,10 +79,10 @@ class CameraSmoothing:
 
     mean_px2: float
     sd_mean_px2: float
-    scatter_px2: float  # of single measurements about the mean
+    scatter_px2: float  # standard deviation of single measurements about the mean
 
     def in_measurement(self, smoothing: ContourSmoothing) -> tuple[float, float]:
-        """Return the smoothing in one measurement among these, and its standard deviation [px²]."""
+        """Return the smoothing in one of the measurements, and its standard deviation [px²]."""
         variance, scatter = smoothing.sd_seen_px2**2, self.scatter_px2**2
         own = scatter / (scatter + variance)
         value = own * smoothing.seen_px2 + (1.0 - own) * self.mean_px2
@@ -92,8 +92,8 @@ class CameraSmoothing:
 def camera_smoothing(smoothings: Sequence[ContourSmoothing]) -> CameraSmoothing:
     """Estimate mean and scatter from all measurements, with a prior from cameras in general.
 
-    The scatter is the root of its mean square under its posterior distribution, over a grid; the
-    mean is that of a normal distribution, given the scatter.
+    The scatter is the root mean square of its posterior distribution, computed over a grid. Given
+    the scatter, the mean has a normal distribution.
     """
     seen = np.array([each.seen_px2 for each in smoothings])
     variance = np.array([each.sd_seen_px2**2 for each in smoothings])
@@ -118,8 +118,8 @@ def with_smoothing(
 ) -> Measurement:
     """Return a measurement corrected for smoothing along contours.
 
-    It is corrected by what all measurements say, or (`learnt` is None) by its own estimate alone.
-    The other pose is moved with it, nearer or farther.
+    It is corrected by what all measurements tell (`learnt`); None: by its own estimate alone. The
+    other pose is moved by the same translation.
     """
     smoothing, uncertainty = measurement.smoothing, measurement.uncertainty
     if smoothing is None or uncertainty is None:

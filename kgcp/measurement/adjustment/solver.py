@@ -32,29 +32,30 @@ from kgcp.measurement.image_model.photometry import SHAPE_PARAMS
 
 EquationsOf = Callable[[Parameters, FloatArray, Misfit], Equations]
 
-# A fit is settled if it moves little against its scatter. These limits are tight because a fit with
-# many unknowns that stops early stays near its start: with limits of 0.4 px and 15 % of the blur,
-# and steps down to 0.05 of log-likelihood, distances depended by 1 σ on the start, and errors of
-# phones were twice as large (0.065 % at R 13-26 px instead of 0.027 %).
+# A fit is settled if a round changes it by little against its deviations. The limits are tight: a
+# fit with many unknowns that stops early stays near its start. With limits of 0.4 px and 15 % of
+# the blur, and steps that gained down to 0.05 in log-likelihood, distances depended on the start by
+# 1 σ, and errors of phones were twice as large (0.065 % at R 13-26 px instead of 0.027 %).
 _MAX_ROUNDS = 6
 _EARLY_STEPS, _STEPS = 4, 8
-_EARLY_GAIN, _LAST_GAIN = 2.0, 0.01  # of log-likelihood; the error left is its square, about
+# A step that gains less in log-likelihood is the last; the error that it leaves is about its square
+_EARLY_GAIN, _LAST_GAIN = 2.0, 0.01
 _SETTLED_NOISE, _SETTLED_PX = 0.15, 0.02
 _SETTLED_BLUR, _SETTLED_STREAK = 0.02, 0.01
 _NOISE_ROUNDS = 3
 _SLACK_PX = 0.4  # by which an approximate pose may be off
-_LARGE_CHANGE = 0.01  # of the contrast, root of the mean square over the pixels
+_LARGE_CHANGE = 0.01  # of the grey values (RMS over the pixels), as a share of the contrast
 _STEPS_BEFORE_HOPELESS = 2
-_NEGLIGIBLE = 1e-6
-_AS_PROMISED = 0.02  # so near its promise, a step has reached the minimum
-_DAMPING, _DAMPED = 1e-7, 1e-3
-_MAX_DAMPING = 1e3  # steps of a thousandth: smaller ones only repeat what fails
-_LEAST_CONTRAST = 0.1  # of the mean over the plate
+_NEGLIGIBLE = 1e-6  # loss of a step that counts as none, in log-likelihood
+_AS_PROMISED = 0.02  # a step whose gain differs from its promise by less has reached the minimum
+_DAMPING, _DAMPED = 1e-7, 1e-3  # at first; after a step that failed
+_MAX_DAMPING = 1e3  # makes steps a thousand times shorter; shorter ones fail as well
+_LEAST_CONTRAST = 0.1  # of ink and plate at a pixel, relative to the mean over the plate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PredictedImage:
-    """A sample under given parameters."""
+    """The image of a sample under given parameters."""
 
     points_m: FloatArray  # (2, n): where the pixels' rays meet the plate
     share: FloatArray  # (n,): white share
@@ -72,7 +73,7 @@ class TargetFit:
     sd: FloatArray  # (n,): noise of every pixel, as level
     misfit: Misfit  # without the priors
     unknowns: Unknowns
-    # of levels that vary, eliminated; None: the light is even
+    # equations with the levels that vary eliminated; None: the light is even
     level_equations: LevelEquations | None = None
 
     @property
@@ -87,7 +88,7 @@ class TargetFit:
 
 
 def moved_to(fit: TargetFit, pose: Pose) -> TargetFit:
-    """Return a fit with another pose that is not adjusted; the Jacobian stays that of the first."""
+    """Return a fit with another pose that is not adjusted; the Jacobian is not computed anew."""
     parameters = fit.parameters.at(pose)
     prediction = predict(fit.sample, parameters)
     current = misfit(fit.sample.levels, prediction.levels, fit.sd, fit.sample.censoring)
@@ -105,10 +106,10 @@ def predict(sample: Sample, parameters: Parameters) -> PredictedImage:
 
 
 def linearise(sample: Sample, parameters: Parameters) -> tuple[PredictedImage, FloatArray]:
-    """Model the grey values of a sample, and return their Jacobian with them.
+    """Model the grey values of a sample, and return them with their Jacobian.
 
-    It is that of `PhotometricModel.linearised`. Derivatives by the point spread's skew are left out
-    where there is none.
+    The Jacobian is that of `PhotometricModel.linearised`. Derivatives by skew and kurtosis of the
+    point spread are 0 where these are 0.
     """
     share = white_share(parameters.matrix, sample.rays, parameters.blur.vector, sample.incidence)
     share, added = _with_edge_terms(share, sample, parameters)
@@ -119,10 +120,15 @@ def linearise(sample: Sample, parameters: Parameters) -> tuple[PredictedImage, F
 def _with_edge_terms(
     share: WhiteShare, sample: Sample, parameters: Parameters
 ) -> tuple[WhiteShare, FloatArray | None]:
-    """Add what skew point spreads, and light that changes across edges, do to the white share.
+    """Add the effects of a skew point spread, and of light that changes across edges.
 
-    Derivatives by pose, blur and levels stay as they are: these terms change them by a few per
-    cent. Also returned is what uneven light adds to the levels of ink and plate (2, n).
+    Returns
+    -------
+    share : WhiteShare
+        Derivatives by pose, blur and levels are not corrected: that would change them by a few per
+        cent.
+    added : (2, n) array or None
+        What uneven light adds to the levels of ink and plate; None: the light is even.
     """
     value, jacobian, field = share.value, share.jacobian, parameters.field
     covariance = parameters.blur.total_covariance
@@ -142,7 +148,7 @@ def _with_edge_terms(
 def _shape_rows(share: WhiteShare, sample: Sample, parameters: Parameters) -> FloatArray:
     """Return the derivatives (5, n) of the white share by third and fourth cumulants.
 
-    They are 0 by those that the point spread does not have.
+    Derivatives by cumulants that are 0 are left 0.
     """
     rows, blur = np.zeros((len(SHAPE_PARAMS), len(share.value))), parameters.blur
     if parameters.has_skew:
@@ -155,7 +161,7 @@ def _shape_rows(share: WhiteShare, sample: Sample, parameters: Parameters) -> Fl
 
 
 def approach(sample: Sample, start: Parameters, unknowns: Unknowns) -> TargetFit:
-    """Come near the minimum from a rough start, on pixels chosen for that start."""
+    """Come near the minimum from a rough start, on pixels that were chosen for it."""
     return _fit_with_noise(
         sample, start, unknowns, steps=_EARLY_STEPS, least_gain=_EARLY_GAIN, is_near=False
     )
@@ -166,7 +172,7 @@ def adjust(
 ) -> TargetFit:
     """Estimate the unknowns in rounds, each with its own choice of pixels, noise and outliers.
 
-    At most `max_pixels` are used, if that is given; if there are more, the estimate is a rough one.
+    If `max_pixels` is given, at most so many are used; if there are more, the estimate is rough.
 
     Raises
     ------
@@ -198,10 +204,10 @@ def _fit_with_noise(
     least_gain: float,
     is_near: bool,
 ) -> TargetFit:
-    """Minimise, and weight residuals by their own noise, until that no longer changes.
+    """Minimise and estimate the noise from the residuals in turn, until the noise is settled.
 
-    From a start that is near, the noise shows before the minimum is reached, and the first
-    minimisation may stop early. Elsewhere it might then go to a wrong minimum.
+    If the start `is_near` the minimum, the noise shows before the minimum is reached, and the first
+    minimisation may stop early. From a start farther away that might lead to a wrong minimum.
     """
     linear = linearise(sample, parameters)
     sd = noise_of(sample, linear[0]).sd
@@ -224,9 +230,9 @@ def _fit_with_noise(
 
 
 def _is_settled(before: Parameters, fit: TargetFit) -> bool:
-    """Tell whether the pixels of a round also suit the fit that was made with them.
+    """Tell whether the pixels that were chosen for a round still suit its result.
 
-    They depend on blur, direction and size. A move along the ray changes the size alone.
+    The choice depends on blur, direction and size. A move along the ray changes the size alone.
     """
     problem, after = fit.sample.problem, fit.parameters
     blur = after.blur.largest_sd_px / before.blur.largest_sd_px
@@ -240,8 +246,9 @@ def _is_settled(before: Parameters, fit: TargetFit) -> bool:
 def noise_of(sample: Sample, prediction: PredictedImage, *, is_even: bool = True) -> GreyNoise:
     """Return the noise of every pixel of a sample, from its residuals.
 
-    Where the light is not even, residuals are also what levels miss, whatever the tone. Pixels that
-    are clipped, or should be, have none: a white that is not bounded would make its own noise.
+    If the light is uneven, the noise is not estimated in bands of the white share, since residuals
+    then also contain what the levels miss. Pixels that are clipped, or are modelled as clipped, are
+    not used: an unbounded white level would inflate its own noise estimate.
     """
     limits, levels = sample.censoring, prediction.levels
     usable = ~limits.is_clipped & (levels > limits.low) & (levels < limits.high)
@@ -270,13 +277,26 @@ def minimise(
 ) -> TargetFit:
     """Minimise the negative log-likelihood by damped Gauss-Newton steps (Levenberg-Marquardt).
 
-    At most `steps` of them, and none after one that gained less than `least_gain`. The Jacobian,
-    and the equations with it, is computed again only after steps that change the grey values by
-    more than 1 % of the contrast, or that promise more than `large_gain`: near the minimum it
-    hardly changes, and it takes most of the time. With `stops_at_new_jacobian`, the step after
-    which it is computed again is the last one; so is the second step, or a later one, that leaves
-    more than `hopeless_total`. `equations_of` makes the equations at some parameters; None: those
-    of pose, blur and light.
+    The Jacobian, and the equations with it, is computed again only after steps that change the grey
+    values by more than 1 % of the contrast, or that promise more than `large_gain`. Near the
+    minimum it hardly changes, and it takes most of the time.
+
+    Parameters
+    ----------
+    steps : int
+        Most steps.
+    least_gain : float
+        A step that gains less in log-likelihood is the last.
+    linear : PredictedImage and Jacobian, optional
+        At the start, if they are known.
+    large_gain : float
+        See above.
+    stops_at_new_jacobian : bool
+        Whether a step after which the Jacobian is computed again is the last.
+    hopeless_total : float
+        The second or a later step is the last if the total is larger than this after it.
+    equations_of : callable, optional
+        Makes the equations at some parameters; None: those of pose, blur and light.
     """
     damping, light = _DAMPING, parameters.light
     contrast = max(light.white - light.black, sample.problem.window.levels_per_count)
@@ -303,7 +323,8 @@ def minimise(
             if is_better or promised < least_gain or damping > _MAX_DAMPING:
                 break
             damping, rejected = max(10.0 * damping, _DAMPED), rejected + 1
-        if is_better and needs_jacobian and rejected:  # not before: the next one might fail, too
+        # after a rejected step, the Jacobian is computed only once a candidate is accepted
+        if is_better and needs_jacobian and rejected:
             attempt, attempt_jacobian = linearise(sample, candidate)
         if not is_better:
             break

@@ -1,4 +1,4 @@
-"""Whether a point spread is skew, or of another kurtosis than a Gaussian, from residuals."""
+"""Tests whether a point spread is skew, or has another kurtosis than a Gaussian, from residuals."""
 
 from __future__ import annotations
 
@@ -14,38 +14,40 @@ from kgcp.measurement.image_model.edge_terms import skew_rows
 from kgcp.measurement.image_model.photometry import SHAPE_PARAMS, SKEW_PARAMS, Param
 from kgcp.measurement.image_model.ray_plate import views_of
 
-_SKEW_SD_PX3 = 1.0  # skewness 0.6 of a spread of 1.2 px
-# Defocus alone has an excess kurtosis of −1, with a pixel and a lens's own blur −0.4 to −0.7. A
-# weaker prior makes rings of R < 13 px worse.
+_SKEW_SD_PX3 = 1.0  # of third cumulants: a skewness of 0.6 for a spread of σ = 1.2 px
+# Defocus alone has an excess kurtosis of −1; with a pixel and a lens's own blur it is −0.4 to −0.7.
+# A weaker prior makes rings of R < 13 px worse.
 _KURTOSIS_SD = 0.5
 SHAPE_PRECISIONS = np.array([_SKEW_SD_PX3**-2] * len(SKEW_PARAMS) + [_KURTOSIS_SD**-2])
 """Inverse a-priori variances of `SHAPE_PARAMS`."""
-# χ² of four degrees of freedom: the 98 targets of six flights of `benchmarks.accuracy` without skew
-# have 13 at most, the 14 of light/lens 35 and more.
+# A larger χ² (four degrees of freedom) says that the point spread is skew. The 98 targets of six
+# flights of `benchmarks.accuracy` without skew have at most 13, the 14 of light/lens at least 35.
 _SKEW_CHI2 = 25.0
-# χ² of one degree of freedom: 88 fits in focus and in even light have 10 at most, those of a coarse
-# renderer 27. Blurred to discs of 1 px radius by defocus, rings of R ≥ 19 px have 19 to 132; of
-# 1.5 px, rings of all sizes 19 and more. By a curve that is not known, tone and sharpening stand in
-# for defocus of up to 2 px, and a kurtosis may stand in for the wrong base of the curve.
+# A larger χ² (one degree of freedom) says that the point spread has a kurtosis. In focus and in
+# even light, 88 fits have at most 10, those of a coarse renderer at most 27. With defocus to discs
+# of 1 px radius, rings of R ≥ 19 px have 19 to 132; with 1.5 px, rings of all sizes have 19 and
+# more. If the curve is unknown, tone and sharpening can imitate a defocus of up to 2 px, and a
+# kurtosis can imitate the wrong base of the curve: the limit is higher.
 _KURTOSIS_CHI2 = 16.0
 _KURTOSIS_CHI2_BY_UNKNOWN_TONE = 40.0
 KURTOSIS_CHI2_WITH_LEVELS = 40.0
-"""χ² from which on kurtosis is free beside levels that vary.
+"""χ² above which the kurtosis is free beside levels that vary.
 
-Over the right base of the tone curve, 32 rings in focus under shadows have 21 at most, and 31 under
-highlights 35 but for one of 83. Out of focus by 2 px, those of R ≥ 28 px have 140 and more, and
-most smaller ones more than this.
+In focus, over the right base of the tone curve, 32 rings under shadows have at most 21; 31 rings
+under highlights have at most 35, except one with 83. Out of focus by 2 px, rings of R ≥ 28 px have
+140 and more, and most smaller ones have more than this limit.
 """
 
 
 def shape_needed(fit: TargetFit) -> list[int]:
-    """Return which parameters of the point spread's shape residuals ask for (score tests).
+    """Return which parameters of the point spread's shape must be free, by score tests.
 
-    Behind a lens whose spread is skew, its kurtosis is not that of a Gaussian either. Levels that
-    vary would take part of a skew that is not asked for: with them it always is, which costs next
-    to nothing (43 plates under shadows: errors and deviations the same within 5 %). Kurtosis beside
-    them is asked for by `KURTOSIS_CHI2_WITH_LEVELS`; otherwise it would let fits rest where they
-    start (by 0.6 σ in a test).
+    Skew comes with kurtosis: a lens whose point spread is skew has no Gaussian's kurtosis either.
+
+    If levels vary, skew is always free, since levels would take up a part of it. That costs next to
+    nothing: on 43 plates under shadows, errors and deviations are the same within 5 %. Kurtosis is
+    then free only by `KURTOSIS_CHI2_WITH_LEVELS`; if it were always free, fits would stay near
+    their start (0.6 σ off in a test).
     """
     if fit.sample.problem.window.binning > 1 or fit.unknowns.has_shape:
         return []
@@ -53,12 +55,12 @@ def shape_needed(fit: TargetFit) -> list[int]:
         return SKEW_PARAMS
     scaled = fit.scaled_jacobian
     by_shape = equations_by_shape(fit, scaled, normal_matrix(scaled, fit.misfit, fit.unknowns))
-    score, own = by_shape.score, by_shape.normal
-    if score[:-1] @ np.linalg.solve(own[:-1, :-1], score[:-1]) > _SKEW_CHI2:
+    score, information = by_shape.score, by_shape.normal
+    if score[:-1] @ np.linalg.solve(information[:-1, :-1], score[:-1]) > _SKEW_CHI2:
         return SHAPE_PARAMS
     is_unknown = fit.sample.problem.tone.is_unknown
     least = _KURTOSIS_CHI2_BY_UNKNOWN_TONE if is_unknown else _KURTOSIS_CHI2
-    return [int(Param.KURTOSIS)] if score[-1] ** 2 > least * own[-1, -1] else []
+    return [int(Param.KURTOSIS)] if score[-1] ** 2 > least * information[-1, -1] else []
 
 
 class ShapeEquations(NamedTuple):
@@ -66,7 +68,7 @@ class ShapeEquations(NamedTuple):
 
     score: FloatArray  # (5,): derivatives of the log-likelihood
     normal: FloatArray  # (5, 5): without priors
-    displacement: FloatArray  # (p, 5): of the free parameters, if the shape is left out
+    displacement: FloatArray  # (p, 5): of the free parameters, per unit of a shape that is left out
 
 
 def equations_by_shape(fit: TargetFit, scaled: FloatArray, normal: FloatArray) -> ShapeEquations:
@@ -88,7 +90,7 @@ def equations_by_shape(fit: TargetFit, scaled: FloatArray, normal: FloatArray) -
 
 
 def _by_shape(fit: TargetFit) -> FloatArray:
-    """Return the derivatives (5, n) of the grey values by skew and kurtosis; the rest is known."""
+    """Return the derivatives (5, n) of the grey values by skew and kurtosis."""
     sample, parameters, share = fit.sample, fit.parameters, fit.prediction.share
     views, blur = views_of(parameters.matrix, sample.rays), parameters.blur
     skew = skew_rows(views, blur.total_covariance, sample.incidence)

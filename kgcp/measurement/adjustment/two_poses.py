@@ -1,7 +1,7 @@
 """The two poses that explain a circle's image, adjusted one after the other.
 
-A start comes first near the minimum on few pixels; its mirror image about the viewing ray does the
-same, and the better one of both is adjusted on all pixels.
+The start is first fitted roughly, on few pixels, and so is its mirror image about the viewing ray.
+The better one of the two is then adjusted on all pixels, and the other one after it.
 """
 
 from __future__ import annotations
@@ -24,12 +24,17 @@ from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.plate_prior import NormalPrior
 
 _START_SLACK_PX = 1.5
-_HALF_SHARPENED, _NARROWED = 0.25, 1.12  # strength, and blur as a share of what seems to be
+# Start of the sharpening: half of the usual strength, and the blur that goes with it, relative to
+# the blur of a fit without sharpening
+_HALF_SHARPENED, _WIDENED = 0.25, 1.12
 _DOUBTFUL_EDGE_NOISE = 0.12  # of the contrast: more than a true pose leaves in most frames
-_SPILT_PX = (0.7, 1.4, -0.7)  # by which edges may be displaced beyond what the start says
-_SLIGHT_TILT_PX, _TRIED_TILT_PX, _ACROSS_STEPS = 0.06, 0.2, 6  # of the minor axis, half
+_SPILT_PX = (0.7, 1.4, -0.7)  # tried displacements of the outer edge beyond that of the start
+# Tilts, by how much they shorten the semi-minor axis
+_SLIGHT_TILT_PX, _TRIED_TILT_PX, _ACROSS_STEPS = 0.06, 0.2, 6
 _MIRRORED_STEPS, _MIRRORED_GAIN = (1, 5), 0.5
-_HOPELESS, _UNLIKELY = 200.0, 40.0  # of log-likelihood: so bad a mirrored pose is fitted no better
+# A mirrored pose that is worse by so much log-likelihood is not fitted any better: after the rough
+# fit (the second), and later
+_HOPELESS, _ROUGHLY_HOPELESS = 200.0, 40.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,9 +47,9 @@ class TwoPoses:
 
 
 def fit_both_poses(problem: FitProblem, pose: Pose, blur: Blur) -> TwoPoses:
-    """Adjust the better one of a start pose and its mirror image about the ray, then the other."""
+    """Adjust the better of a start pose and its mirror image about the ray, then the other one."""
     rough = _off_the_saddle(_rough_fit(problem, pose, blur))
-    other = _mirrored_fit(rough, _UNLIKELY)
+    other = _mirrored_fit(rough, _ROUGHLY_HOPELESS)
     near, far = (other, rough) if other.total < rough.total else (rough, other)
     best = adjust_with_streak(problem, _with_sharpening(problem, near.parameters))
     other = fit_at(best, far.parameters.pose)
@@ -55,9 +60,10 @@ def fit_both_poses(problem: FitProblem, pose: Pose, blur: Blur) -> TwoPoses:
 
 
 def _off_the_saddle(rough: TargetFit) -> TargetFit:
-    """Try a tilt across the one that was found, if that is slight.
+    """Try a tilt about the perpendicular axis, if the tilt that was found is slight.
 
-    A start that is tilted the wrong way comes near the tilt of 0, where nothing pulls it across.
+    A start that is tilted the wrong way ends near the tilt of 0. The gradient vanishes there, and
+    nothing pulls it to the right tilt.
     """
     parameters, radius_px = rough.parameters, rough.sample.problem.outer_radius_px
     pose = parameters.pose
@@ -76,17 +82,17 @@ def _off_the_saddle(rough: TargetFit) -> TargetFit:
 
 
 def _with_sharpening(problem: FitProblem, parameters: Parameters) -> Parameters:
-    """Go half the way to what usual sharpening does, if there may be any: it was left out."""
+    """Start from half of the usual sharpening, which rough fits leave out, if there may be any."""
     if not problem.sharpening_px:
         return parameters
     light = replace(parameters.light, sharpening=_HALF_SHARPENED)
-    return Parameters.of(parameters.pose, parameters.blur.scaled(_NARROWED), light)
+    return Parameters.of(parameters.pose, parameters.blur.scaled(_WIDENED), light)
 
 
 def _rough_fit(problem: FitProblem, pose: Pose, blur: Blur) -> TargetFit:
-    """Come near the minimum; from other distances if there is none near the start pose.
+    """Fit roughly; from other distances, too, if the fit from the start pose is poor.
 
-    Where the plate is burnt white its light spills over the edges, and the start may be far off.
+    The light of a burnt plate spills over the edges, so that the start may be far off.
     """
     rough = _approach(problem, pose, blur)
     for shift_px in _SPILT_PX:
@@ -100,7 +106,7 @@ def _rough_fit(problem: FitProblem, pose: Pose, blur: Blur) -> TargetFit:
 
 
 def _approach(problem: FitProblem, pose: Pose, blur: Blur) -> TargetFit:
-    """Fit few pixels, without an unsharp mask: that would need all, and displaces little."""
+    """Fit few pixels, without sharpening: that would need all pixels, and displaces little."""
     light = first_levels(problem, pose)
     plain = replace(problem, sharpening_px=0.0)
     few = plain.few_pixels
@@ -110,7 +116,7 @@ def _approach(problem: FitProblem, pose: Pose, blur: Blur) -> TargetFit:
 
 
 def choose_by_prior(problem: FitProblem, poses: TwoPoses, prior: NormalPrior) -> TwoPoses:
-    """Let the poses change places where the prior outweighs the image; adjust the new best one."""
+    """Exchange the poses if the prior outweighs the image, and adjust the new best one."""
     if advantage(poses, pose_covariance(poses.best), prior) >= 0.0:
         return poses
     if poses.best.level_equations is None:
@@ -124,10 +130,10 @@ def choose_by_prior(problem: FitProblem, poses: TwoPoses, prior: NormalPrior) ->
 
 
 def advantage(poses: TwoPoses, covariance: PoseCovariance, prior: NormalPrior | None) -> float:
-    """Return the Δχ² by which the other pose is worse: of the image, and of the prior.
+    """Return the Δχ² by which the other pose is worse: that of the image plus that of the prior.
 
-    That of the image counts as much as its residuals are independent; both normals are known
-    about equally well.
+    The Δχ² of the image is divided by the inflation of the covariance, since correlated residuals
+    count less. Both normals are taken to have the covariance of the better pose.
     """
     best, other = poses.best, poses.other
     of_image = 2.0 * (other.total - best.total) / covariance.inflation
@@ -138,7 +144,7 @@ def advantage(poses: TwoPoses, covariance: PoseCovariance, prior: NormalPrior | 
 
 
 def _mirrored_fit(fit: TargetFit, hopeless: float = _HOPELESS) -> TargetFit:
-    """Fit from the mirrored pose; a hopeless one is left after few steps."""
+    """Fit from the mirrored pose; a fit that is hopeless after the first step ends there."""
     parameters = fit.parameters
     mirrored = parameters.at(parameters.pose.mirrored())
     linear = None
@@ -159,7 +165,7 @@ def _mirrored_fit(fit: TargetFit, hopeless: float = _HOPELESS) -> TargetFit:
 
 
 def fit_at(fit: TargetFit, pose: Pose) -> TargetFit:
-    """Fit another pose to the pixels of a fit, unless it is hopeless."""
+    """Fit another pose to the pixels of a fit; if that is hopeless, return it as it is."""
     there = moved_to(fit, pose)
     if there.total - fit.total > _HOPELESS:
         return there

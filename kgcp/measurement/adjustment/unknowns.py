@@ -1,4 +1,4 @@
-"""What is estimated besides the pose, and how: light by the response, blur round or as a streak."""
+"""Which parameters are estimated: light by the response, blur as a Gaussian or as a streak."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ from kgcp.measurement.adjustment.solver import TargetFit, adjust
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.image_model.photometry import PARAM_COUNT, Param, Tone
 
-_MANY_PIXELS_RADIUS_PX = 40.0  # from there on, few pixels first save more than to choose them costs
+_MANY_PIXELS_RADIUS_PX = 40.0  # larger rings are first fitted on few pixels, which saves time
 _SHORTEST_STREAK_PX = 2.0  # below, a streak looks like a Gaussian
-_TOO_LONG, _TOO_LONG_FROM2 = 0.095, 15.0  # what a Gaussian fitted to a streak's edges shows of it
+# A Gaussian that is fitted to the edges of a streak makes it too long, by up to the first share;
+# the formula is in `_streak_of`.
+_TOO_LONG, _TOO_LONG_FROM2 = 0.095, 15.0
 
 _PRIOR_SD = {
     Param.BLUR_DIFFERENCE: 0.5,
@@ -33,14 +35,14 @@ _PRIOR_SD = {
 }
 _STATED_TONE_SD = 0.02  # of the three shapes of a stated curve; 0.06 and 0.2 are no better
 EDGE_TONE_CHI2 = 100.0
-"""χ² from which on edges have a tone of their own beside levels that vary.
+"""χ² above which edges have a tone of their own beside levels that vary.
 
-Over the base of the tone curve that asks for it less, 29 rings under another program's shadows and
-in its dirt have 20 at most. Of 24 rings in dirt behind a bilateral filter (R ≥ 37 px), 41 of 48
-fits over both bases have 200 and more. Wrong bases of the curve ask for it, too, less than that.
+In 29 rings under another program's shadows and in its dirt, the fit over the base with the smaller
+χ² has at most 20. Of 24 rings in dirt behind a bilateral filter (R ≥ 37 px), 41 of the 48 fits over
+both bases have 200 and more. A wrong base of the curve raises the χ², too, but by less.
 """
 _EDGE_TONE_SD = 0.15  # with 0.5, errors under highlights are twice as large
-# Prior of the white where tone is free: on burnt plates, the two would drift together without it.
+# Prior of the white if the tone is free: without it, the two drift together on burnt plates.
 _WHITE, _WHITE_SD = 1.0, 0.4
 _ALWAYS = [*range(6), Param.BLUR_MEAN, Param.BLACK, Param.WHITE, Param.SLOPE_X, Param.SLOPE_Y]
 _GAUSSIAN = [Param.BLUR_DIFFERENCE, Param.BLUR_XY]
@@ -56,32 +58,34 @@ _OF_TONE = {
     Tone.NEAR_SRGB: [*_TONE, Param.SHARPENING],
     Tone.UNKNOWN: [*_SHAPED, Param.LINEAR_SHARPENING],
     Tone.UNKNOWN_FROM_LINE: _SHAPED,
-    Tone.OF_BINS: [Param.TONE_1],  # how far edges are displaced; their shape is that of the bins
+    Tone.OF_BINS: [Param.TONE_1],  # takes how far a tone curve displaces edges within bins
 }
 
 
-def adjust_with_streak(problem: FitProblem, start: Parameters, *, moves: bool = True) -> TargetFit:
-    """Adjust with a Gaussian blur, or with an elongated one as a streak; the pose if it `moves`."""
+def adjust_with_streak(
+    problem: FitProblem, start: Parameters, *, moves_pose: bool = True
+) -> TargetFit:
+    """Adjust with a Gaussian blur, or with a streak; with `moves_pose`, adjust the pose, too."""
     streak = _streak_of(start.blur)
     if streak is None:
-        best = adjust(problem, start, unknowns_of(problem, has_streak=False, moves=moves))
+        best = adjust(problem, start, unknowns_of(problem, has_streak=False, moves_pose=moves_pose))
         streak, start = _streak_of(best.parameters.blur), best.parameters
         if streak is None:
             return best
-    unknowns = unknowns_of(problem, has_streak=True, moves=moves)
+    unknowns = unknowns_of(problem, has_streak=True, moves_pose=moves_pose)
     streaked = Parameters.of(start.pose, streak, start.light)
     is_large = problem.outer_radius_px > _MANY_PIXELS_RADIUS_PX
     near = adjust(problem, streaked, unknowns, problem.few_pixels if is_large else None)
     return adjust(problem, near.parameters, unknowns) if near.sample.is_thinned else near
 
 
-def unknowns_of(problem: FitProblem, *, has_streak: bool, moves: bool = True) -> Unknowns:
-    """Return which parameters are free, with weak priors on what one frame hardly tells."""
-    return _unknowns(problem.tone, has_streak=has_streak, moves=moves)
+def unknowns_of(problem: FitProblem, *, has_streak: bool, moves_pose: bool = True) -> Unknowns:
+    """Return which parameters are free, with weak priors on those that one frame hardly tells."""
+    return _unknowns(problem.tone, has_streak=has_streak, moves_pose=moves_pose)
 
 
 @cache
-def _unknowns(tone: Tone, *, has_streak: bool, moves: bool) -> Unknowns:
+def _unknowns(tone: Tone, *, has_streak: bool, moves_pose: bool) -> Unknowns:
     free = [*_ALWAYS, *(_STREAK if has_streak else _GAUSSIAN), *_OF_TONE[tone]]
     mean, precision = np.zeros(PARAM_COUNT), np.zeros(PARAM_COUNT)
     for param, sd in _PRIOR_SD.items():
@@ -90,43 +94,49 @@ def _unknowns(tone: Tone, *, has_streak: bool, moves: bool) -> Unknowns:
         precision[_TONE] = _STATED_TONE_SD**-2
     elif tone.is_shaped:
         mean[Param.WHITE], precision[Param.WHITE] = _WHITE, _WHITE_SD**-2
-    estimated = np.array(sorted(free)[0 if moves else 6 :])
+    estimated = np.array(sorted(free)[0 if moves_pose else 6 :])
     return Unknowns(estimated, mean, precision, precision[estimated])
 
 
 def without_even_light(unknowns: Unknowns) -> Unknowns:
     """Return the unknowns of a fit whose levels vary.
 
-    The levels take what gradient and curvature of the light would, and their offsets what ink and
-    plate would. These two stay as the scale of the levels and of the tone curve. A white that is
-    free stretches that scale while the levels shrink, and the image hardly changes: along this
-    curved valley all steps fail, and fits stay where they start.
+    The levels replace gradient and curvature of the light, and their offsets replace black and
+    white. These two are fixed, as the scale of the levels and of the tone curve. If white were
+    free, it could stretch that scale while the levels shrink, and the image would hardly change:
+    steps fail along such a curved valley, and fits stay where they start.
 
-    Beside the levels the two sharpenings are too much: of a highlight on a ring of 107 px they came
-    out with 0.85 and −0.74, and the distance off by 4.6 σ.
+    Two sharpenings beside the levels are too many: with a highlight on a ring of R 107 px, their
+    strengths came out as 0.85 and −0.74, and the distance was off by 4.6 σ. Only the one after the
+    tone curve stays.
     """
     free = unknowns.free[~np.isin(unknowns.free, _EVEN_LIGHT)]
     return replace(unknowns, free=free, free_precision=unknowns.precision[free])
 
 
 def with_pose(unknowns: Unknowns) -> Unknowns:
-    """Return the unknowns of a fit whose pose does not move, with the pose among them."""
+    """Return the unknowns of a fit with a fixed pose, with the pose added."""
     free = np.append(np.arange(6), unknowns.free)
     return replace(unknowns, free=free, free_precision=unknowns.precision[free])
 
 
 def with_edge_tone(unknowns: Unknowns) -> Unknowns:
-    """Return the unknowns of a fit whose levels vary, with the tone of edges among them."""
+    """Return the unknowns of a fit whose levels vary, with the tone of edges added."""
     free, precision = np.append(unknowns.free, int(Param.EDGE_TONE)), unknowns.precision.copy()
     precision[Param.EDGE_TONE] = _EDGE_TONE_SD**-2
     return Unknowns(free, unknowns.mean, precision, precision[free])
 
 
 def _streak_of(blur: Blur) -> Blur | None:
-    """Read an elongated Gaussian as a streak of uniform motion; None if it is too short.
+    """Return the streak of uniform motion that an elongated Gaussian stands for, if it is long.
 
-    One fitted to edges, by least squares, has more variance than the streak: by up to a tenth of
-    the length, as far as that is long against the blur across it.
+    A Gaussian fitted to the edges by least squares makes the streak too long: by up to a tenth of
+    its length, the more so the longer it is against the blur across it.
+
+    Returns
+    -------
+    Blur or None
+        None if the streak is too short to be told from a Gaussian.
     """
     difference, mean = 0.5 * (blur.xx - blur.yy), 0.5 * (blur.xx + blur.yy)
     half_range = math.hypot(difference, blur.xy)
