@@ -1,4 +1,4 @@
-"""One disc adjusted in rounds: pixels, foreign pixels and noise are settled anew in each."""
+"""The adjustment of one disc in rounds, each with its own choice of pixels and its own noise."""
 
 from __future__ import annotations
 
@@ -42,18 +42,20 @@ from kgcp.measurement.image_model.noise import (
 )
 
 _ROUNDS = 3
-_SETTLED_PX, _SETTLED_BLUR = 0.6, 0.2  # a round that moves less is the last
-_FIRST_BLUR_PX, _FIRST_BLUR = 0.8, 0.3  # pixels, and of the radius at most
+_SETTLED_PX, _SETTLED_BLUR = 0.6, 0.2  # a round that changes edge and blur by less is the last
+_FIRST_BLUR_PX, _FIRST_BLUR = 0.8, 0.3  # in pixels, at most this share of the radius
 _LEAST_CONTRAST_COUNTS = 4.0
-_MAX_OFF_PX, _MAX_OFF = 1.0, 0.25  # how far the centre may be from the outline's: pixels, radii
-_MAX_GROWN_PX, _MAX_GROWN = 2.0, 0.4  # and the edge: burnt light displaces it by more than a pixel
-# Residuals at the edge, of the contrast, and share of outliers. Small discs that are burnt and
-# sharpened leave up to 0.19; what is not a disc, mostly more than 0.3.
+# How far the result may be from the outline, in pixels or in radii, whichever is more: the centre,
+# and the size. Burnt light displaces edges by more than a pixel.
+_MAX_OFF_PX, _MAX_OFF = 1.0, 0.25
+_MAX_GROWN_PX, _MAX_GROWN = 2.0, 0.4
+# Residuals at the edge, as a share of the contrast, and share of outliers. Small discs that are
+# burnt and sharpened have residuals of up to 0.19; what is not a disc, mostly more than 0.3.
 _MAX_EDGE_NOISE, _MAX_OUTLIERS = 0.2, 0.3
-_LEAST_REDUNDANCY = 6.0  # with less, errors have no deviation worth stating (Student's t)
-_LEAST_CURVED_PX = 6.0  # radius from which on discs tell a curved light from their blur
-_CURVED = 25.0  # least χ² of five terms: noise alone makes more in one of ten thousand discs
-_FOREIGN_SIGMAS, _FOREIGN_CONTRAST = 6.0, 0.12  # residuals of what is neither disc nor ground
+_LEAST_REDUNDANCY = 6.0  # with less, a standard deviation says little of the errors (Student's t)
+_LEAST_CURVED_PX = 6.0  # smaller discs do not tell curved light from blur
+_CURVED = 25.0  # least χ² of five terms; noise alone exceeds it in one of ten thousand discs
+_FOREIGN_SIGMAS, _FOREIGN_CONTRAST = 6.0, 0.12  # least residual of what is neither disc nor ground
 
 
 class DiscRejection(Exception):  # noqa: N818 - the outcome of one disc
@@ -70,9 +72,9 @@ class DiscTask:
 
     grey: GreyArray
     outline: DiscOutline
-    others: Sequence[Geometry]  # edges whose pixels are left out
-    inner: FloatArray = field(default_factory=lambda: NO_INNER)  # as of `DiscPixels`
-    is_ground_even: bool = True  # or has a texture of its own
+    others: Sequence[Geometry]  # other edges, whose pixels are left out
+    inner: FloatArray = field(default_factory=lambda: NO_INNER)  # as in `DiscPixels`
+    is_ground_even: bool = True  # False: the ground has a texture
 
     @property
     def is_dark(self) -> bool:
@@ -86,7 +88,7 @@ class DiscTask:
 
 
 def geometry_of(vector: FloatArray) -> Geometry:
-    """Return centre and symmetric stretch (5,), of which the moments (5,) are M M / 4."""
+    """Return centre and symmetric stretch M (5,) of centroid and second moments M M / 4 (5,)."""
     square = 4.0 * vector[[2, 3, 3, 4]].reshape(2, 2)
     area = math.sqrt(max(float(np.linalg.det(square)), 1e-12))
     root = (square + area * np.eye(2)) / math.sqrt(float(np.trace(square)) + 2.0 * area)
@@ -99,7 +101,7 @@ def outline_geometry(outline: DiscOutline) -> Geometry:
 
 
 def adjust_disc_in_any_light(task: DiscTask, free: DiscUnknowns, blur_px: float = 0.0) -> DiscFit:
-    """Adjust a disc, by light of second order where the edge of a shadow or of a spot crosses it.
+    """Adjust a disc; if the edge of a shadow or of a spot crosses it, with light of second order.
 
     Raises
     ------
@@ -112,9 +114,9 @@ def adjust_disc_in_any_light(task: DiscTask, free: DiscUnknowns, blur_px: float 
 
 
 def is_in_curved_light(fit: DiscFit, task: DiscTask) -> bool:
-    """Return whether residuals show that the light over a disc is not linear.
+    """Tell whether residuals show that the light over a disc is not linear.
 
-    Only where it is seen: a second order that is always free would cost accuracy.
+    The second order is free only then: if it were always free, that would cost accuracy.
     """
     if len(task.inner) or task.radius_px < _LEAST_CURVED_PX:
         return False
@@ -144,7 +146,7 @@ def adjust_disc(
             raise DiscRejection(DiscReason.CROWDED, "too little free ground")
         state = state or _start(task, window, index, geometry, blur, free)
         limits = find_censoring(window.levels, window.levels_per_count, window.width)
-        if limits.share > MUCH_CLIPPED:  # of a level that is clipped no gradient is seen
+        if limits.share > MUCH_CLIPPED:  # a clipped level shows no gradient
             free = free.without_ink_slope()
         fit = _adjust_on(task, window, limits, index, state, free)
         foreign = foreign_pixels(fit)
@@ -188,10 +190,10 @@ def _start(
     blur: Blur,
     free: DiscUnknowns,
 ) -> DiscState:
-    """Return levels from the middle of the disc and the ground around it.
+    """Return the start: the outline, and levels from inside the disc and the ground around it.
 
-    From pixels that no other edge reaches: in the middle of a ring is its hole. If its circles are
-    adjusted with it, from those that are the most between its edges.
+    The levels are medians of pixels that no other edge reaches, so that a ring's hole is left out.
+    Of a ring that is adjusted as a whole, the inside is taken from the pixels with the most ink.
 
     Raises
     ------
@@ -231,14 +233,15 @@ def _check_inside(grey: GreyArray, geometry: Geometry) -> None:
 
 
 def foreign_pixels(fit: DiscFit) -> BoolArray | None:
-    """Return which pixels of the window show neither disc nor ground; None if there are none."""
+    """Return which pixels of the window show neither disc nor ground; None: none does."""
     window, index = fit.sample.window, fit.sample.index
     black, white = fit.state.plateaus(fit.free.tone)
     limit = np.maximum(_FOREIGN_SIGMAS * fit.sd, _FOREIGN_CONTRAST * (white - black))
     clips = fit.sample.censoring
     model = np.clip(fit.levels, clips.low, clips.high)
     off = np.abs(fit.sample.levels - model) > limit
-    if len(fit.sample.pixels.inner):  # what its circles do not explain there speaks against them
+    # within a ring that is adjusted as a whole, such pixels are evidence against its circles
+    if len(fit.sample.pixels.inner):
         off &= distances_px(fit.sample.pixels.places_px, fit.state.geometry) > 0.0
     if not off.any():
         return None
@@ -249,7 +252,7 @@ def foreign_pixels(fit: DiscFit) -> BoolArray | None:
 
 
 def check_disc_fit(fit: DiscFit, outline: DiscOutline) -> None:
-    """Refuse a fit that is not that of the outlined disc.
+    """Refuse a fit that is poor, or not that of the outlined disc.
 
     Raises
     ------

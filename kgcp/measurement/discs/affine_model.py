@@ -1,14 +1,14 @@
-"""The image of a disc in the affine form: no camera, an ellipse with five parameters.
+"""The image of a disc as an affine image of the unit circle: an ellipse, without a camera.
 
-With the symmetric stretch M of the ellipse, u = M⁻¹ (p − c) makes the disc the unit circle. The
-blur B of the image is M⁻¹ B M⁻¹ there, so that `blurred_discs.render`, which blurs the circles of a
-coded target, blurs this one. Derivatives go back the same way: when M changes by dM, the disc moves
-past a pixel by M⁻¹ dM u, and the blur changes by −(M⁻¹ dM Σ + Σ dM M⁻¹).
+The ellipse has a centre c and a symmetric stretch M. In the coordinates u = M⁻¹ (p − c) the disc is
+the unit circle, and the blur B of the image becomes Σ = M⁻¹ B M⁻¹. So `blurred_discs.render`, which
+blurs the circles of a coded target, also blurs a disc. Derivatives are carried back: when M changes
+by dM, the disc moves past a pixel by M⁻¹ dM u, and the blur changes by −(M⁻¹ dM Σ + Σ dM M⁻¹).
 
-Pixels are squares; the blur has the variance of their integration, but the shape of a Gaussian.
-That displaces no edge that is seen as a whole. Where an edge is seen only up to what clips, blur
-and level made up for the difference, and discs were 0.01 px too large or too small. So what the
-squares' fourth cumulants add to the image of an edge is added, to first order.
+Pixels are squares. The blur contains the variance of their integration, but its shape is a
+Gaussian's. That displaces no edge that is seen as a whole. Of a clipped edge only a part is seen;
+there, blur and level made up for the difference in shape, and discs came out 0.01 px too large or
+too small. So the effect of the squares' fourth cumulants on edges is added, to first order.
 """
 
 from __future__ import annotations
@@ -28,31 +28,32 @@ from kgcp.measurement.image_model.ray_plate import PLATE_ROWS, SLOPE_ROWS
 
 _VIEW_ROWS = 6
 _SHIFT_ROWS = 3  # the value, and its derivatives by a shift of the disc
-_SLACK_PX = 1.0  # what the edge may move before the pixels in reach are found anew
+_SLACK_PX = 1.0  # how far the edge may move while the pixels in reach stay the same
 _LEAST_SEMI_AXIS_PX = 0.4
-_FOURTH_CUMULANT_PX4 = -1.0 / 120.0  # of an even distribution over a pixel's width
+_FOURTH_CUMULANT_PX4 = -1.0 / 120.0  # of a uniform distribution over a pixel's width
 
 # x, y [px] and the stretch xx, xy, yy [px]
 Geometry = FloatArray
 
 NO_INNER = np.empty((0, 3))
-"""Of a disc: no circles within its edge."""
+"""`DiscPixels.inner` of a disc: no circles within its edge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscPixels:
-    """n pixels of a photograph, as the edge of a disc divides them, or the edges of a ring."""
+    """n pixels of a photograph around a disc, or around a ring that is adjusted as a whole."""
 
     places_px: FloatArray  # (2, n)
     is_dark: bool  # whether the area within the outer edge is darker than the ground
-    # (k, 3): circles within the outer edge, where that is the unit circle: centre and radius
+    # (k, 3): centre and radius of the circles within the outer edge, which is the unit circle
     inner: FloatArray
-    # (n,): white share of the pixels that the edge does not reach
+    # (n,): white share of the pixels that no edge reaches
     background: FloatArray
     circles: FloatArray  # (k + 1, 5): as `render` takes them
-    starts: IndexArray  # (k + 2,): where the pixels begin that a circle reaches, …
-    members: IndexArray  # … among these
-    kurtosis: float  # excess of the point spread's, beyond that of pixels
+    # (k + 2,): circle i reaches the pixels members[starts[i]:starts[i + 1]]
+    starts: IndexArray
+    members: IndexArray
+    kurtosis: float  # excess kurtosis of the point spread, beyond that of pixels
 
     @classmethod
     def of(
@@ -65,7 +66,7 @@ class DiscPixels:
         inner: FloatArray = NO_INNER,
         kurtosis: float = 0.0,
     ) -> DiscPixels:
-        """Find which pixels (2, n) feel an edge."""
+        """Find which pixels (2, n) an edge reaches."""
         smallest, largest = semi_axes(geometry)
         sd_px = blur.largest_sd_px
         circles = np.zeros((len(inner) + 1, 5))
@@ -89,8 +90,8 @@ class DiscPixels:
     def white_share(self, geometry: Geometry, blur: Blur) -> WhiteShare:
         """Return the share of the brighter level in every pixel, with derivatives.
 
-        They are laid out as those of a plate: rows 0…4 by the geometry, row 5 zero, then by the
-        blur.
+        Derivatives are laid out as those of a plate: rows 0…4 by the geometry, row 5 zero, then by
+        the blur.
         """
         views, inverse = np.empty((_VIEW_ROWS, self.places_px.shape[1])), np.empty(3)
         _meet_disc(geometry, self.places_px, inverse, views)
@@ -100,16 +101,16 @@ class DiscPixels:
         if self.kurtosis:
             self._add_kurtosis(views, blur, on_disc)
         members = self.members[: self.starts[1]]  # the same for all circles
-        _add_pixels_shape(views, inverse, blur.total_covariance, self.circles, members, on_disc)
+        _add_fourth_cumulants(views, inverse, blur.total_covariance, self.circles, members, on_disc)
         slopes = np.empty((SLOPE_ROWS, views.shape[1]))
         _carry_slopes(inverse, blur.vector, views, on_disc, slopes)
         return WhiteShare(views[:2], on_disc[0], slopes)
 
     def _add_kurtosis(self, views: FloatArray, blur: Blur, on_disc: FloatArray) -> None:
-        """Add what the point spread's kurtosis makes of the edges, as `blurred_plate.kurtosis_row`.
+        """Add the effect of the point spread's kurtosis, as `blurred_plate.kurtosis_row` does.
 
-        Added are the value and its derivatives by a shift of the disc; those by the blur are left
-        out.
+        It is added to the value and to its derivatives by a shift of the disc, not to those by the
+        blur.
         """
         changed = np.zeros_like(on_disc)
         for factor in (1.0 + KURTOSIS_SPREAD, 1.0 - KURTOSIS_SPREAD):
@@ -120,7 +121,7 @@ class DiscPixels:
         on_disc[:_SHIFT_ROWS] += self.kurtosis / (6.0 * KURTOSIS_SPREAD**2) * changed[:_SHIFT_ROWS]
 
     def shares_within(self, geometry: Geometry, blur: Blur) -> FloatArray:
-        """Return how much (k + 1, n) of every pixel each of a ring's circles covers."""
+        """Return the share (k + 1, n) of every pixel that each blurred circle of a ring covers."""
         views, inverse = np.empty((_VIEW_ROWS, self.places_px.shape[1])), np.empty(3)
         _meet_disc(geometry, self.places_px, inverse, views)
         shares = np.zeros((len(self.circles), 1, views.shape[1]))
@@ -153,7 +154,7 @@ def sharpest_px(blur: Blur) -> float:
 
 
 def limited(geometry: Geometry) -> Geometry:
-    """Return a geometry that is an ellipse, whatever a step has made of it."""
+    """Return the geometry with semi-axes that are large enough, after a step that went too far."""
     smallest, _ = semi_axes(geometry)
     if smallest >= _LEAST_SEMI_AXIS_PX:
         return geometry
@@ -163,7 +164,7 @@ def limited(geometry: Geometry) -> Geometry:
 
 
 def distances_px(places_px: FloatArray, geometry: Geometry) -> FloatArray:
-    """Return how far pixels (2, n) are outside the ellipse, negative inside; first order [px]."""
+    """Return first-order distances (n,) of pixels from the ellipse, negative inside [px]."""
     off_px = np.empty(places_px.shape[1])
     _distances(places_px, geometry, off_px)
     return off_px
@@ -179,7 +180,7 @@ def _distances(places_px: FloatArray, geometry: FloatArray, off_px: FloatArray) 
         rho = math.sqrt(u * u + v * v)
         slope_x, slope_y = a * u + b * v, b * u + d * v
         slope = math.sqrt(slope_x * slope_x + slope_y * slope_y)
-        # at the centre, which has no direction, as far inside as the mean radius
+        # the centre has no direction: the mean radius is its distance
         off_px[i] = (rho - 1.0) * rho / slope if rho > 1e-6 else -math.sqrt(determinant)
 
 
@@ -187,7 +188,7 @@ def _distances(places_px: FloatArray, geometry: FloatArray, off_px: FloatArray) 
 def _meet_disc(
     geometry: FloatArray, places_px: FloatArray, inverse: FloatArray, views: FloatArray
 ) -> None:
-    """Fill in the inverse stretch (3,) xx, xy, yy and the first rows of `meet_plate`'s views."""
+    """Fill in the inverse stretch (3,) xx, xy, yy and the first rows of views, as `meet_plate`."""
     determinant = geometry[2] * geometry[4] - geometry[3] * geometry[3]
     inverse[0], inverse[1] = geometry[4] / determinant, -geometry[3] / determinant
     inverse[2] = geometry[2] / determinant
@@ -238,7 +239,7 @@ def _carry_slopes(
 
 
 @compiled
-def _add_pixels_shape(
+def _add_fourth_cumulants(
     views: FloatArray,
     inverse: FloatArray,
     covariance: tuple[float, float, float],
@@ -246,11 +247,12 @@ def _add_pixels_shape(
     members: IndexArray,
     on_disc: FloatArray,
 ) -> None:
-    """Add what pixels' fourth cumulants κ, along x and along y, make of the edges: κ/24 ∂⁴.
+    """Add the effect of the pixels' fourth cumulants κ along x and along y on the edges.
 
-    Of a straight edge with the unit normal (a, b) that is blurred to Φ(z), z = distance/σ, the
-    fourth derivatives together are (a⁴ + b⁴) (3z − z³) φ(z)/σ⁴. Added are the value and its
-    derivatives by a shift of the disc, as `render` has them; those by the blur are left out.
+    It is κ/24 times the sum of the fourth derivatives along x and y. For a straight edge with the
+    unit normal (a, b), blurred to Φ(z) with z = distance/σ, that sum is (a⁴ + b⁴) (3z − z³)
+    φ(z)/σ⁴. The effect is added to the value and to its derivatives by a shift of the disc, as
+    `render` has them, not to those by the blur.
     """
     xx, yy, xy = covariance
     for c in range(len(circles)):

@@ -1,10 +1,11 @@
-"""Places that may be discs: closed contours at the local middle between dark and bright.
+"""Places that may be discs: closed contours midway between the local dark and bright.
 
-A pixel is dark or bright against the midrange of a small window around it, and neither where that
-window is even. Around every edge this leaves a dark band and a bright one, whose common border is
-the edge, whatever the size of the disc and however the light falls off. The outer border of a dark
-component is the outline of a dark disc, that of a bright one the outline of a bright disc. So rings
-and hollow marks are found by both of their edges, and discs that nearly touch stay apart.
+A pixel is dark or bright compared with the midrange of a small window around it, and neither if
+that window is even. So every edge has a dark band and a bright band on its sides, whose common
+border is the edge, whatever the size of the disc and however the light falls off. The outer border
+of a dark component is the outline of a dark disc, that of a bright component the outline of a
+bright disc. Rings and hollow marks are found by both of their edges, and discs that nearly touch
+stay apart.
 
 Edges that are blurred over more than the window are seen in reduced images.
 """
@@ -22,19 +23,18 @@ from kgcp.measurement.discs.records import Polarity
 # Tuning. `benchmarks.calibrate.sets` counts the discs found in photographs of fields, and
 # `benchmarks.ground.plain_targets` those found in rendered frames.
 _WINDOW = 11  # pixels: sees both sides of an edge blurred by σ = 2 px
-_LEAST_RANGE = 12  # grey values of 255: fainter edges are not followed
+_LEAST_RANGE = 12  # grey values of 255: fainter edges are ignored
 _RANGE_SIGMAS = 12.0  # of the noise: a window of 121 even pixels has a range of 5 σ
 _FEWEST_POINTS = 8  # of a contour: R = 1.5 px
-_LEAST_FILL = (
-    0.88  # area of a contour over that of the ellipse with its moments; a square has 0.955
-)
-_MOST_ASPECT = 4.5  # of the axes: tilts to 77°
-_LEAST_RADIUS_REDUCED_PX = 5.0  # smaller ones are better seen in the image before reduction
+# Least ratio of a contour's area to that of the ellipse with its moments; a square has 0.955
+_LEAST_FILL = 0.88
+_MOST_ASPECT = 4.5  # ratio of the axes: tilts to 77°
+_LEAST_RADIUS_REDUCED_PX = 5.0  # smaller discs are better seen in the less reduced image
 _SMALLEST_SIDE, _SMALLEST_FRAME = 48, 8  # pixels of a reduced image, and of any
 
 
 def find_blobs(grey: GreyArray) -> tuple[FloatArray, list[Polarity]]:
-    """Return ellipses that may be discs, roughly, and their polarities.
+    """Return approximate ellipses of what may be discs, and their polarities.
 
     Parameters
     ----------
@@ -44,8 +44,8 @@ def find_blobs(grey: GreyArray) -> tuple[FloatArray, list[Polarity]]:
     Returns
     -------
     blobs : (n, 5) array
-        Centre x, y [px] and symmetric stretch xx, xy, yy [px]: the ellipse is the unit circle
-        times this matrix.
+        Centre x, y [px] and symmetric stretch xx, xy, yy [px]: the matrix that makes the ellipse of
+        the unit circle.
     polarities : list of Polarity
     """
     octave = 0
@@ -67,7 +67,7 @@ def find_blobs(grey: GreyArray) -> tuple[FloatArray, list[Polarity]]:
 
 
 def stretched_to_bytes(grey: GreyArray) -> GreyArray:
-    """Return an image as 0…255, stretched to all but the brightest thousandth if it is deeper."""
+    """Return an image as 0…255; if it is deeper, the middle 99.8 % of its grey values fill that."""
     if grey.dtype == np.uint8:
         return grey
     low, high = np.quantile(grey[::4, ::4], [0.001, 0.999])
@@ -98,7 +98,7 @@ def _links(hierarchy: GreyArray | None) -> list[list[int]]:
 
 
 def _blob(contour: GreyArray, octave: int) -> tuple[float, ...] | None:
-    """Return the ellipse with the moments of a contour in the frame's pixels, if it is one."""
+    """Return the ellipse with the moments of a contour, in the frame's pixels; None: it is none."""
     _, _, width, height = cv2.boundingRect(contour)
     if max(width, height) > 2.0 * _MOST_ASPECT * min(width, height):
         return None
@@ -111,7 +111,7 @@ def _blob(contour: GreyArray, octave: int) -> tuple[float, ...] | None:
     determinant = xx * yy - xy * xy
     if determinant <= 0.0 or area < _LEAST_FILL * 4.0 * math.pi * math.sqrt(determinant):
         return None
-    # Contours run through the centres of the outermost pixels, half a pixel inside the edge.
+    # contours run through the centres of the outermost pixels, half a pixel inside the edge
     mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
     a = 2.0 * math.sqrt(mean + half) + 0.5
     b = 2.0 * math.sqrt(max(mean - half, 0.0)) + 0.5

@@ -1,8 +1,8 @@
-"""Tone curve, sharpening and focus of a camera, learned from the largest discs of a photograph.
+"""Tone curve, sharpening and focus of a camera, learned from some large discs of its photographs.
 
-A disc alone tells little of them, and takes errors of the curve for a displacement where the light
-falls off. All discs share them: some large ones are adjusted together, as one problem in which each
-disc has its own ellipse, blur and light. What they say together is the prior for all.
+A disc alone tells little of them. Where the light falls off, it takes errors of the curve for a
+displacement. But all discs share them: some large ones are adjusted together, as one problem in
+which each disc has its own ellipse, blur and light. The result is the prior for all discs.
 """
 
 from __future__ import annotations
@@ -39,51 +39,58 @@ from kgcp.measurement.discs.tone_curve import WAVES
 from kgcp.measurement.image_model.compression import is_compressed_near, quantisation_steps
 from kgcp.measurement.image_model.photometry import Tone
 
-# Discs of a photograph to learn from: as many as have so long an edge together, as a sum of radii,
-# and at least so many. Of dark ones of 3.5 px under film's curve, nine leave a fifth of its
-# second wave, and displace centres by 0.002 px.
+# How many discs of a photograph are learned from: so many that their radii add up to this, and at
+# least so many. Nine dark discs of R 3.5 px under film's curve would be too few: they miss a fifth
+# of its second wave, which displaces centres by 0.002 px.
 _RADII_PX, _FEWEST_DISCS = 110.0, 9
 _LEAST_RADIUS_PX = 5.0  # of discs to learn from, if there are enough
-# From there on, the two levels fall off differently enough to tell, but for an unknown curve.
+# From this radius on, discs show a gradient of the darker level of its own, unless the curve is
+# unknown.
 _LARGE_RADIUS_PX = 20.0
 _LARGEST_BLUR = 0.3  # of the radius, to start from
-# Masks are tried from 1 px on by steps of this factor, if the camera sharpens at all.
+# Masks around σ = 1 px are tried in steps of this factor, if the camera sharpens: if the strength
+# is at least the first and at least so many standard deviations.
 _MASK_STEP, _MOST_STEPS = 1.25, 2
 _LEAST_SHARPENING, _SIGNIFICANT = 0.05, 4.0
 _BENT = {Tone.SRGB: Tone.UNKNOWN, Tone.LINEAR: Tone.UNKNOWN_FROM_LINE}
-# Least gain of twice the log-likelihood by three parameters: noise makes more once in a thousand
-# times. A straight line that is bent by chance makes discs larger or smaller by 1 %.
-_WORTHY_BENDS = 16.0
-# Times this power of the excess. Burnt, sharpened photographs have an excess of 4 to 6, their bends
-# gain up to 1200, and what these pretend displaces the discs. Film's curve, with an excess of 1 to
-# 1.5, gains 70 to 800 on nine discs (`benchmarks.calibrate.operator`).
-_BY_EXCESS = 3
-# By a mask that is not quite the camera's, the wrong one of two bent curves may be likelier. So
-# those are compared again by their own masks whose loss is larger by less than this share of what
-# the bends gain. Farther ones would win ties alone, and displace edges by 0.15 px then.
-_NEARLY = 0.2
-# Where a line is likelier than sRGB's curve, the latter bent is to be likelier than a bent line by
-# more than this share of that: linear cameras under JPEG (`benchmarks.calibrate.operator`).
-_LIKE_LINE = 0.25
-# A second start for compressed photographs: the S that cameras add for contrast. From what the
-# compressed values say, steps may end in a curve that is less likely by 14.
+# A curve is bent if that gains more than this in twice the log-likelihood. Bends are three
+# parameters; noise alone exceeds it once in a thousand times. A straight line that is bent by
+# chance makes discs larger or smaller by 1 %.
+_SIGNIFICANT_BENDS = 16.0
+# The limit is multiplied by this power of the excess by which discs contradict each other. Burnt,
+# sharpened photographs have an excess of 4 to 6; their bends gain up to 1200, stand for what the
+# model lacks, and displace the discs. Film's curve, with an excess of 1 to 1.5, gains 70 to 800 on
+# nine discs (`benchmarks.calibrate.operator`).
+_EXCESS_POWER = 3
+# If the mask is not quite the camera's, the wrong one of two bent curves may be likelier. So bent
+# curves are compared again, each with its own best mask, if they are less likely than the best by
+# less than this share of what its bends gain. Others would only win by ties, and would displace
+# edges by 0.15 px.
+_NEARLY_AS_LIKELY = 0.2
+# Where a line is likelier than sRGB's curve, it is the line that is bent, unless bent sRGB is
+# likelier than the bent line by more than this share of the line's advantage over sRGB. This is for
+# linear cameras under JPEG (`benchmarks.calibrate.operator`).
+_LINE_PREFERENCE = 0.25
+# A second start for compressed photographs: the S that cameras add for contrast. From the curve of
+# the compressed values alone, steps may end in a curve that is less likely by 14.
 _MORE_CONTRAST = np.array((0.0, -0.4, 0.0))
-# Steps of JPEG in grey values, median of the nine longest waves: 2 at quality 92, 4 at 85. From
-# there on film's curve is learnt wrongly in half of the cases. In light that falls off by 5 % over
-# the radius, centres of dark discs of R 8 px are then off by 0.015 px, 1.5 to 2 stated deviations.
+# Compression is coarse if JPEG's steps in grey values (median over the nine longest waves) reach
+# this: they are 2 at quality 92 and 4 at 85. Film's curve is then learned wrongly in half of the
+# cases. In light that falls off by 5 % over the radius, centres of dark discs of R 8 px are then
+# off by 0.015 px, 1.5 to 2 stated deviations.
 _COARSE_STEP = 4.0
-# The excess kurtosis of the point spread is tried in such steps, from that of a Gaussian or from
-# one of a camera out of focus, whichever is likelier, over so many of them.
+# The excess kurtosis of the point spread is tried in steps of 0.2, at most three of them, from 0 (a
+# Gaussian) or from three steps below 0 (out of focus), whichever is likelier.
 _KURTOSIS_STEP, _DEFOCUSED_STEP, _MOST_KURTOSIS_STEPS = 0.2, -3.0, 3
-# Least gain of twice the log-likelihood by it, times the power of the excess above: of photographs
-# as they are, and of compressed ones. In focus, 65 to 100 discs have up to 3 of that, and in JPEGs
-# of unknown curves up to 126. Blurred to discs of 2 px radius, they have 500 and more by known
-# curves, 600 by film's in three of four cases, and up to 270 in JPEGs; 14 discs by unknown curves
-# have 23 and 30 (`benchmarks.calibrate.operator`).
-_WORTHY_KURTOSIS, _WORTHY_IN_COMPRESSED = 16.0, 100.0
-_LITTLE_BENT = 0.02  # standard deviation of the waves of a curve that is not bent
-# Of χ² with so many degrees of freedom; with none, discs share nothing to contradict each other in.
-_MEDIAN_SQUARE = {0: 1.0, 1: 0.455, 4: 3.357}
+# A kurtosis is taken if it gains more than this in twice the log-likelihood, times the power of the
+# excess: in photographs as they are, and in compressed ones. Gains over that power: in focus, 65 to
+# 100 discs have up to 3, and in JPEGs with unknown curves up to 126. Blurred to discs of 2 px
+# radius, they have 500 and more with known curves, 600 with film's in three of four cases, and up
+# to 270 in JPEGs; 14 discs with unknown curves have 23 and 30 (`benchmarks.calibrate.operator`).
+_SIGNIFICANT_KURTOSIS, _SIGNIFICANT_IN_COMPRESSED = 16.0, 100.0
+_LITTLE_BENT = 0.02  # standard deviation of the waves of a curve that counts as not bent
+# Median of χ² by its degrees of freedom; with none, discs share nothing to contradict each other in
+_MEDIAN_CHI2 = {0: 1.0, 1: 0.455, 4: 3.357}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,26 +100,29 @@ class CameraTone:
     tone: Tone
     sharpening_px: float = 0.0  # σ of its unsharp mask; 0: it does not sharpen
     known: ProcessingPrior | None = None
-    blur_px: float = 0.0  # median of those that it was learned from; 0: none
-    kurtosis: float = 0.0  # excess of its point spread's
-    is_curve_unknown: bool = False  # or it is stated
-    is_compressed: bool = False  # a photograph, as far as that shows
-    is_reliable: bool = True  # or compression has left too little of the photographs to tell it
+    blur_px: float = 0.0  # median of the discs that it was learned from; 0: none
+    kurtosis: float = 0.0  # excess kurtosis of its point spread
+    is_curve_unknown: bool = False  # False: the curve is stated
+    is_compressed: bool = False  # whether a photograph is seen to be compressed
+    is_reliable: bool = True  # False: compression has left too little to learn from
 
 
 def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) -> CameraTone:
-    """Return the tone to use for discs of one photograph, or of all by one camera.
+    """Learn the tone for the discs of one photograph, or of all photographs by one camera.
 
-    An unknown curve is sRGB's or a straight line, whichever makes the same pixels of all discs
-    together likelier. It is bent only if that makes them significantly likelier still: where white
-    is burnt and black sunk, little of the curve is seen, and its bends explain what the model of
-    the image lacks. Then the width of the mask is adjusted, where the camera sharpens. If the curve
-    that is likeliest so far says that the camera is out of focus, all are compared once more with
-    the kurtosis of such a point spread. Where white is burnt, an unknown curve that is not bent for
-    all discs may bend a little in each.
+    1. A kurtosis is looked for with the likeliest curve. If the camera proves to be out of focus,
+       all curves are compared with that kurtosis.
+    2. An unknown curve is sRGB's or a straight line, whichever makes the same pixels of all discs
+       together likelier. It is bent only if that makes them significantly likelier still: where
+       white is burnt and black is clipped, little of the curve is seen, and its bends would explain
+       what the model of the image lacks.
+    3. If the camera sharpens, the width of its mask is adjusted.
+    4. If JPEG compressed the photographs, discs are adjusted anew to what it left.
+    5. Where white is burnt, an unknown curve that is not bent for all discs may bend a little in
+       each.
     """
     tone = Tone.of(response)
-    chosen = [task for tasks in photographs for task in _to_learn_from(tasks)]
+    chosen = [task for tasks in photographs for task in _learning_tasks(tasks)]
     fits = _first_fits(chosen, tone)
     plain, bent = _by_curves(fits, tone)
     in_focus = _likeliest(bent or plain)
@@ -132,7 +142,7 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     best = _likeliest(
         [
             _with_best_mask(joint, partial(_adjusted_together, sds=sds))
-            for joint in _worthy(plain, bent)
+            for joint in _worth_comparing(plain, bent)
         ]
     )
     if best is None:
@@ -161,7 +171,7 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
 
 
 def unknowns_of_disc(task: DiscTask, camera: CameraTone) -> DiscUnknowns:
-    """Return what is estimated of a disc."""
+    """Return the unknowns of a disc, with what is known of the camera."""
     return DiscUnknowns.of(
         camera.tone,
         camera.known,
@@ -174,15 +184,15 @@ def unknowns_of_disc(task: DiscTask, camera: CameraTone) -> DiscUnknowns:
 
 
 def first_blur_px(task: DiscTask, camera: CameraTone) -> float:
-    """Return the blur to start from; 0: not known."""
+    """Return the blur to start from; 0: none is known."""
     return min(camera.blur_px, _LARGEST_BLUR * task.radius_px)
 
 
-def _to_learn_from(tasks: Sequence[DiscTask]) -> list[DiscTask]:
+def _learning_tasks(tasks: Sequence[DiscTask]) -> list[DiscTask]:
     """Return the tasks of some large discs of high contrast, evenly drawn from the larger half."""
     large = [task for task in tasks if task.radius_px >= _LEAST_RADIUS_PX]
     count = _FEWEST_DISCS
-    if len(large) < min(count, len(tasks)):  # a mark alone does not speak for all
+    if len(large) < min(count, len(tasks)):  # a few large marks may not be like all others
         large = list(tasks)
     if large:
         radius_px = float(np.median([task.radius_px for task in large]))
@@ -195,12 +205,13 @@ def _to_learn_from(tasks: Sequence[DiscTask]) -> list[DiscTask]:
 
 
 def _first_fits(tasks: Sequence[DiscTask], tone: Tone) -> list[DiscFit]:
-    """Adjust discs each by itself, by a known curve or by sRGB's; those that lead anywhere.
+    """Adjust discs each by itself, with a known curve or sRGB's; return the fits that succeed.
 
-    Of burnt discs the upper end of the curve is not seen, and the edge of a shadow looks like one
-    of its bends: without them, if enough are left. The light over a disc is taken to be linear:
-    beside a second order of its own, held fast while all are adjusted together, the curve would be
-    bent to fit it.
+    Burnt discs do not show the upper end of the curve, and the edge of a shadow looks like a bend
+    of it: both are left out if enough other discs remain.
+
+    The light over a disc is taken to be linear. A second order would be held fixed while all discs
+    are adjusted together, and the curve would be bent to fit it.
     """
     free = DiscUnknowns.of(Tone.LINEAR)
     if tone is not Tone.LINEAR:
@@ -218,23 +229,23 @@ def _first_fits(tasks: Sequence[DiscTask], tone: Tone) -> list[DiscFit]:
 
 
 def _by_curves(fits: Sequence[DiscFit], tone: Tone) -> tuple[list[JointFit], list[JointFit]]:
-    """Return discs adjusted together by plain curves that may be the camera's, and by bent ones."""
+    """Return discs adjusted together with each plain curve that is possible, and each bent one."""
     if tone is not Tone.UNKNOWN:
         return _joints(fits, (tone,)), []
     return _joints(fits, tuple(_BENT)), _joints(fits, tuple(_BENT.values()))
 
 
 def _learned_kurtosis(in_focus: JointFit, sds: Sequence[FloatArray]) -> float:
-    """Return the excess kurtosis of the point spread that makes discs together likeliest.
+    """Return the excess kurtosis of the point spread that makes all discs together likeliest.
 
-    0, unless one of a camera that is out of focus is significantly likelier. A positive one would
-    be that of a spread with long tails. Discs that another program rendered with jagged edges seem
-    to have 0.6, and with it, a focal length of 6673 px was off by 1.0 instead of 0.9 px.
+    It is 0 unless a negative one, that of a camera out of focus, is significantly likelier. A
+    positive one would mean long tails. Discs that another program rendered with jagged edges seem
+    to have 0.6; with it, a focal length of 6673 px was off by 1.0 instead of 0.9 px.
 
     Parameters
     ----------
     in_focus : JointFit
-        Discs without kurtosis, by the likeliest curve.
+        Discs without kurtosis, with the likeliest curve.
     sds : sequence of (n,) arrays
         As for `adjust_together`.
     """
@@ -247,7 +258,7 @@ def _learned_kurtosis(in_focus: JointFit, sds: Sequence[FloatArray]) -> float:
 
     states = [fit.state for fit in in_focus.fits]
     begin, first = 0.0, in_focus
-    defocused = at(_DEFOCUSED_STEP)  # a wrong curve may make it likely to be in focus
+    defocused = at(_DEFOCUSED_STEP)  # a wrong curve may hide it near 0
     if defocused is not None and defocused.loss < in_focus.loss:
         begin, first = _DEFOCUSED_STEP, defocused
     steps, best = _likeliest_along(lambda steps: at(begin + steps), first, _MOST_KURTOSIS_STEPS)
@@ -255,19 +266,19 @@ def _learned_kurtosis(in_focus: JointFit, sds: Sequence[FloatArray]) -> float:
     if gain <= 0.0:
         return 0.0
     is_compressed = any(each is not None for each in _steps_of(best.fits))
-    least = _WORTHY_IN_COMPRESSED if is_compressed else _WORTHY_KURTOSIS
-    is_worthy = 2.0 * gain > least * _excess(best) ** _BY_EXCESS
+    least = _SIGNIFICANT_IN_COMPRESSED if is_compressed else _SIGNIFICANT_KURTOSIS
+    is_worthy = 2.0 * gain > least * _excess(best) ** _EXCESS_POWER
     return (begin + steps) * _KURTOSIS_STEP if is_worthy else 0.0
 
 
 def _with_kurtosis(fit: DiscFit, kurtosis: float) -> DiscFit:
-    """Return a fit whose pixels are seen through a point spread of some kurtosis."""
+    """Return a fit whose pixels have a point spread with this kurtosis."""
     pixels = replace(fit.sample.pixels, kurtosis=kurtosis)
     return replace(fit, sample=replace(fit.sample, pixels=pixels))
 
 
 def _joints(fits: Sequence[DiscFit], tones: Sequence[Tone]) -> list[JointFit]:
-    """Return discs adjusted together by each of some curves, if they can be."""
+    """Return discs adjusted together with each of some curves, without those that fail."""
     return [joint for joint in (_from_first_fits(fits, tone) for tone in tones) if joint]
 
 
@@ -276,26 +287,29 @@ def _likeliest(joints: Sequence[JointFit]) -> JointFit | None:
     return min(joints, key=lambda joint: joint.loss, default=None)
 
 
-def _worthy(plain: Sequence[JointFit], bent: Sequence[JointFit]) -> list[JointFit]:
-    """Return discs by the likeliest curve, and by others that are nearly as likely.
+def _worth_comparing(plain: Sequence[JointFit], bent: Sequence[JointFit]) -> list[JointFit]:
+    """Return the joint fits that are worth a comparison by their own masks.
 
-    By a bent curve only if it is significantly likelier than a plain one. Where discs contradict
-    each other more than their noise lets them, the model lacks something that the bends may stand
-    for. A line is bent itself unless sRGB's curve is much likelier when bent: nearly straight but
-    for its dark end, that one makes discs too large or too small.
+    Without a significant gain by bending, that is the likeliest plain curve alone. Where discs
+    contradict each other more than their noise explains, the model lacks something that the bends
+    may stand for: the gain must be larger there.
+
+    Otherwise they are the bent curves that are nearly as likely as the best. But if the line is the
+    likelier plain curve, it is the bent line alone, unless bent sRGB is much likelier: sRGB's curve
+    bent nearly straight keeps a bend at its dark end, which makes discs too large or too small.
     """
     known, best = _likeliest(plain), _likeliest(bent)
     if known is None or best is None:
         return [joint for joint in (best or known,) if joint]
     gain = known.loss - best.loss
-    if 2.0 * gain <= _WORTHY_BENDS * _excess(best) ** _BY_EXCESS:
+    if 2.0 * gain <= _SIGNIFICANT_BENDS * _excess(best) ** _EXCESS_POWER:
         return [known]
     line = next((joint for joint in bent if joint.tone is Tone.UNKNOWN_FROM_LINE), None)
     if known.tone is Tone.LINEAR and line is not None:
         farther = max(joint.loss for joint in plain) - known.loss
-        if line.loss - best.loss <= _LIKE_LINE * farther:
+        if line.loss - best.loss <= _LINE_PREFERENCE * farther:
             return [line]
-    return [joint for joint in bent if joint.loss - best.loss < _NEARLY * gain]
+    return [joint for joint in bent if joint.loss - best.loss < _NEARLY_AS_LIKELY * gain]
 
 
 def _are_burnt(fits: Sequence[DiscFit]) -> bool:
@@ -304,7 +318,7 @@ def _are_burnt(fits: Sequence[DiscFit]) -> bool:
 
 
 def _slightly_bent(known: ProcessingPrior) -> ProcessingPrior:
-    """Return what is known of the camera with bends that are hardly there."""
+    """Return what is known of the camera, with bends free by a small standard deviation."""
     precision = known.precision.copy()
     waves = np.arange(WAVES)
     precision[waves, waves] = _LITTLE_BENT**-2
@@ -312,7 +326,7 @@ def _slightly_bent(known: ProcessingPrior) -> ProcessingPrior:
 
 
 def _from_first_fits(fits: Sequence[DiscFit], tone: Tone) -> JointFit | None:
-    """Adjust discs with what they share, from first fits; None if they cannot be."""
+    """Adjust discs together, from their first fits; None if that fails."""
     if not fits:
         return None
     sharpening = float(np.median([fit.state.vector[Row.SHARPENING] for fit in fits]))
@@ -361,12 +375,12 @@ def _samples_by(
 
 
 def _with_best_mask(joint: JointFit, adjusted: Callable[..., JointFit | None]) -> JointFit:
-    """Return discs adjusted by the mask that makes them likeliest.
+    """Return discs adjusted with the mask that makes them likeliest.
 
     Parameters
     ----------
     adjusted : callable
-        Returns discs adjusted from fits, states, by a curve and by a mask; None if they cannot be.
+        Adjusts discs, given fits, states, a curve and the σ of a mask; None if that fails.
     """
     sharpening = CAMERA_ROWS.index(Row.SHARPENING)
     sd = float(np.sqrt(np.linalg.inv(joint.precision)[sharpening, sharpening]))
@@ -377,7 +391,7 @@ def _with_best_mask(joint: JointFit, adjusted: Callable[..., JointFit | None]) -
         states = [fit.state for fit in joint.fits]
         return adjusted(joint.fits, states, joint.tone, _MASK_STEP**step * SHARPENING_PX)
 
-    # anew, since the pixels beside the modelled ones are masked by what is known by now
+    # anew also for step 0, since the mask uses the states for the pixels that are not adjusted
     _, best = _likeliest_along(at, at(0) or joint, _MOST_STEPS)
     return best
 
@@ -385,16 +399,16 @@ def _with_best_mask(joint: JointFit, adjusted: Callable[..., JointFit | None]) -
 def _likeliest_along(
     at: Callable[[float], JointFit | None], first: JointFit, most_steps: int
 ) -> tuple[float, JointFit]:
-    """Return the number of steps, and the fit there, that makes discs likeliest.
+    """Return the number of steps at which discs are likeliest, and the fit there.
 
-    Steps are taken one by one, and a parabola through the last three gives the rest.
+    Steps are taken one by one; a parabola through the best and its neighbours refines the result.
 
     Parameters
     ----------
     at : callable
-        Returns the fit after so many steps, not always whole ones; None if there is none.
+        Returns the fit after a number of steps, which need not be whole; None if it fails.
     first : JointFit
-        That after 0 steps.
+        The fit after 0 steps.
     """
     tried = {0: first}
     for direction in (1, -1):
@@ -423,14 +437,14 @@ def _likeliest_along(
 
 
 def _steps_of(fits: Sequence[DiscFit]) -> list[FloatArray | None]:
-    """Return the steps that JPEG rounded each disc's photograph to, by `quantisation_steps`."""
+    """Return JPEG's quantisation steps of each disc's photograph; None: not compressed."""
     photos = {id(fit.sample.window.photo): fit.sample.window.photo for fit in fits}
     steps = {key: quantisation_steps(photo) for key, photo in photos.items()}
     return [steps[id(fit.sample.window.photo)] for fit in fits]
 
 
 def _are_compressed(fits: Sequence[DiscFit]) -> bool:
-    """Return whether a photograph is compressed, as far as it shows around one of its discs."""
+    """Tell whether any photograph is compressed, by the surroundings of one disc of each."""
     first = {id(fit.sample.window.photo): fit for fit in reversed(fits)}
     return any(
         is_compressed_near(fit.sample.window.photo, fit.state.geometry[:2])
@@ -439,7 +453,7 @@ def _are_compressed(fits: Sequence[DiscFit]) -> bool:
 
 
 def _are_coarse(steps: Sequence[FloatArray | None]) -> bool:
-    """Return whether most photographs are compressed so much that curves are learnt wrongly."""
+    """Tell whether the median photograph is compressed so much that curves are learned wrongly."""
     lowest = [0.0 if each is None else float(np.median(each[:3, :3])) for each in steps]
     return float(np.median(lowest)) >= _COARSE_STEP
 
@@ -447,20 +461,22 @@ def _are_coarse(steps: Sequence[FloatArray | None]) -> bool:
 def _before_compression(
     joint: JointFit, bent: JointFit, steps: Sequence[FloatArray | None]
 ) -> JointFit:
-    """Adjust discs anew to what JPEG left of the coefficients, if it compressed them.
+    """Adjust discs anew to what JPEG left of their coefficients, if the photographs are compressed.
 
-    It may have hidden what bends the curve. A plain one is bent if that is significant now.
+    Compression may have hidden the bend of the curve. A plain curve becomes a bent one if its bends
+    are significant now.
 
     Parameters
     ----------
     joint : JointFit
-        By the curve that makes the compressed values likeliest.
+        Discs with the curve that makes the compressed values likeliest.
     bent : JointFit
-        By the likeliest plain curve, bent, and a mask of the usual width. By what compression
-        leaves, bent curves of small discs are equally likely, whereas the plain ones differ by 100
-        and more. A line cannot be bent to film's curve: centres would be off by 0.006 px.
+        Discs with the likeliest plain curve, bent, and a mask of the usual width. The base is taken
+        from the plain curves, which differ by 100 and more in log-likelihood; bent curves of small
+        discs are equally likely by what compression leaves. A line cannot be bent to film's curve:
+        centres would be off by 0.006 px.
     steps : sequence of (8, 8) arrays
-        Of each disc's photograph; None: it was not compressed.
+        Of each disc's photograph; None: not compressed.
     """
     if all(each is None for each in steps):
         return joint
@@ -480,7 +496,7 @@ def _before_compression(
 
 
 def _with_waves(state: DiscState, tone: Tone, waves: FloatArray) -> DiscState:
-    """Return the state by a curve with other amplitudes (3,), and the same grey values."""
+    """Return the state with other amplitudes (3,) of the curve, but the same grey values."""
     vector, levels = state.vector.copy(), [Row.BLACK, Row.WHITE]
     vector[Row.WAVE_1 : Row.SHARPENING] = waves
     vector[levels] = DiscState(vector).tone(tone).light(np.array(state.plateaus(tone)))
@@ -488,20 +504,22 @@ def _with_waves(state: DiscState, tone: Tone, waves: FloatArray) -> DiscState:
 
 
 def _is_bent(joint: JointFit) -> bool:
-    """Return whether a curve is more bent than one that hardly is, and than the model may lack.
+    """Tell whether the bends of a curve are significant.
 
-    Of film's curve in JPEGs of quality 92, the excess is 1.3 to 2.1. By its third power as above, a
-    quarter of the photographs of dark discs of R 5 px seemed to be sRGB's: centres were off by
-    0.012 px where light falls off by 5 % over the radius, with its square by 0.007 px.
+    They must differ from those of a curve that counts as not bent, and more so where discs
+    contradict each other. The limit grows with the square of that excess here. With film's curve in
+    JPEGs of quality 92, the excess is 1.3 to 2.1; with its third power, a quarter of the
+    photographs of dark discs of R 5 px seemed to be sRGB's, and centres were off by 0.012 px where
+    light falls off by 5 % over the radius. With its square they are off by 0.007 px.
     """
     waves, excess = joint.shared[:WAVES], _excess(joint)
     cov = excess * np.linalg.inv(joint.precision)[:WAVES, :WAVES] + _LITTLE_BENT**2 * np.eye(WAVES)
     square = excess * float(waves @ np.linalg.solve(cov, waves))
-    return square > _WORTHY_BENDS * excess * excess
+    return square > _SIGNIFICANT_BENDS * excess * excess
 
 
 def _state_by(fit: DiscFit, tone: Tone, sharpening: float) -> DiscState:
-    """Return the state of a first fit, for another tone curve with the same levels."""
+    """Return the state of a first fit for another tone curve, with the same grey levels."""
     vector = fit.state.vector.copy()
     vector[Row.SHARPENING] = sharpening
     if not tone.is_srgb:
@@ -510,18 +528,18 @@ def _state_by(fit: DiscFit, tone: Tone, sharpening: float) -> DiscState:
 
 
 def _known_by(joint: JointFit) -> ProcessingPrior:
-    """Return what discs adjusted together say of the camera, as it may be off.
+    """Return what discs adjusted together say of the camera, with its precision.
 
-    Where they contradict each other more than their noise lets them, it is known so much worse.
+    The precision is divided by the excess by which discs contradict each other.
     """
     return ProcessingPrior(joint.shared, joint.precision / _excess(joint))
 
 
 def _excess(joint: JointFit) -> float:
-    """Return the square of how much more than by their noise discs contradict each other."""
+    """Return the variance of discs' contradictions relative to that of their noise; at least 1."""
     own = joint.informations[0].any(axis=0)
     squares = [
         float(score[own] @ np.linalg.lstsq(information[np.ix_(own, own)], score[own])[0])
         for score, information in zip(joint.scores, joint.informations, strict=True)
     ]
-    return max(float(np.median(squares)) / _MEDIAN_SQUARE[int(own.sum())], 1.0)
+    return max(float(np.median(squares)) / _MEDIAN_CHI2[int(own.sum())], 1.0)

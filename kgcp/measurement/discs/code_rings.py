@@ -1,7 +1,7 @@
-"""Codes of rings of sectors around discs.
+"""Codes of the rings of sectors around discs.
 
 The ellipse of a disc gives the affine map from the plane of its ring to the photograph, up to a
-turn, which does not change the code.
+rotation. The code does not depend on that rotation.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from kgcp.measurement.discs.records import DiscOutline
 from kgcp.targets.fields.points import CodeRing
 
 _PER_SECTOR = 16  # samples along the ring
-_MIDDLE = slice(_PER_SECTOR // 4, 3 * _PER_SECTOR // 4)  # of a sector: blur mixes its ends
-_ACROSS = (0.35, 0.5, 0.65)  # of the ring's width
-_LEAST_MARGIN = 0.2  # of the contrast, from the middle between 0 and 1
+_MIDDLE = slice(_PER_SECTOR // 4, 3 * _PER_SECTOR // 4)  # samples used: blur mixes a sector's ends
+_ACROSS = (0.35, 0.5, 0.65)  # where across the ring it is sampled, in its widths
+_LEAST_MARGIN = 0.2  # of a sector's level from 0.5, midway between the ground and the disc
 _LEAST_CONTRAST = 0.02  # of what is white in the photograph
-_MOST_UNEVEN = 0.35  # of the contrast: the ground beside a letter shows its neighbours
+_MOST_UNEVEN = 0.35  # variation of the ground, of the contrast; around a letter it is larger
 
 
 def read_codes(
     grey: GreyArray, outlines: Sequence[DiscOutline], ring: CodeRing
 ) -> list[int | None]:
-    """Return the code around each disc, the least number that a turn makes of it; None: no code.
+    """Return the code around each disc, as the least number over all its rotations; None: no code.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def read_codes(
 
 
 def _read(values: np.ndarray, outline: DiscOutline, ring: CodeRing) -> int | None:
-    """Read the sectors around a disc; None: no clear ring is there, or it leaves the frame."""
+    """Read the sectors around a disc; None: the ring is not clear, or not within the frame."""
     count = ring.bits * _PER_SECTOR
     angles = 2.0 * np.pi / count * np.arange(count)
     ellipse = outline.ellipse

@@ -1,7 +1,7 @@
 """Operators of the literature, for comparison: weighted centroid, and target function.
 
-Both take the grey values as they are: no tone curve, no clipping, no light that falls off, no edge
-but the disc's own. Their covariances are those of independent residuals.
+Both use the grey values as they are. They know no tone curve, no clipping, no light that falls off,
+and no edge but the disc's own. Their covariances are those of independent residuals.
 """
 
 from __future__ import annotations
@@ -26,17 +26,18 @@ from kgcp.measurement.discs.records import (
 )
 from kgcp.measurement.image_model.blur import Blur
 
-_BLUR = Blur(0.64, 0.64, 0.0)  # of the pixels that are chosen: to 5.8 px from the outline
-_AROUND_PX = 2.0  # from the outline outwards begins what tells the background
+_BLUR = Blur(0.64, 0.64, 0.0)  # pixels are chosen for it: up to 5.8 px from the outline
+_AROUND_PX = 2.0  # pixels farther outside the outline show the background
 _THRESHOLD_SIGMAS, _THRESHOLD = 3.0, 0.06  # of the background's noise, and of the contrast
 _FEWEST_PIXELS = 12
 
 
 def measure_by_centroid(task: DiscTask) -> Disc | DiscMiss:
-    """Measure the centroid Σ g x / Σ g, weighted by grey values g above the background.
+    """Measure the centroid Σ g x / Σ g, weighted by the grey values g above the background.
 
-    Eq. (2) of the Australis paper (seed of automatic recognition): pixels count that differ from
-    the background by 3 σ of its noise, or by 6 % of the contrast. Second moments likewise.
+    This is eq. (2) of the Australis paper (seed of automatic recognition). Pixels count if they
+    differ from the background by 3 σ of its noise and by 6 % of the contrast. Second moments are
+    computed in the same way.
     """
     window, places, levels = _pixels(task)
     if window is None:
@@ -82,10 +83,12 @@ def measure_by_centroid(task: DiscTask) -> Disc | DiscMiss:
 def measure_by_gaussian(task: DiscTask) -> Disc | DiscMiss:
     """Fit the target function T = s Ω(−E) + β of Otepka & Fraser (2004), eqs. (2)-(5).
 
-    With E = x̄²/a² + ȳ²/b² − 1 and the Gaussian's distribution function Ω of standard deviation σ,
-    a length in E: the blur is wider along the major axis. Derivatives are those of T itself, with
-    ∂T/∂σ = (E/σ) s G(−E), whose sign eq. (9) has wrong; the ellipse is a symmetric matrix instead
-    of (a, b, φ), of which φ is undefined for a circle.
+    E = x̄²/a² + ȳ²/b² − 1, and Ω is the distribution function of a Gaussian with the standard
+    deviation σ. Since σ is in units of E, the blur is wider along the major axis.
+
+    Two things differ from the paper. Derivatives are those of T itself, with ∂T/∂σ = (E/σ) s G(−E);
+    eq. (9) has the wrong sign. And the ellipse is a symmetric matrix instead of (a, b, φ), as φ is
+    undefined for a circle.
     """
     window, places, levels = _pixels(task)
     if window is None:
@@ -93,7 +96,7 @@ def measure_by_gaussian(task: DiscTask) -> Disc | DiscMiss:
     geometry = outline_geometry(task.outline)
     off_px = distances_px(places, geometry)
     is_inmost = off_px <= min(-0.5, float(np.median(off_px)))
-    if not is_inmost.any():  # all its own pixels belong to something else
+    if not is_inmost.any():  # other edges reach all pixels within
         return DiscMiss(task.outline, DiscReason.CROWDED, "no pixel within the disc")
     inside = float(np.median(levels[is_inmost]))
     outside = float(np.median(levels[off_px > min(_AROUND_PX, float(off_px.max()) - 0.5)]))

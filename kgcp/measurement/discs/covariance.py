@@ -1,9 +1,10 @@
-"""Covariance of a disc's centroid and moments, from the residuals as they are.
+"""Covariance of a disc's centroid and moments, from residuals that may be correlated.
 
-As for coded targets (`adjustment.covariance`): scores are summed over arcs of the edge, and their
-scatter is held against what independent residuals of this very fit would leave. A disc has few
-arcs: only a whole photograph shows that variances are below those of independent pixels. That is
-where JPEG compressed it, block by block of 8 × 8 pixels: so scores are summed over these, too.
+As for coded targets (`adjustment.covariance`), scores are summed over arcs of the edge, and their
+scatter is compared with the one that this fit would leave of independent residuals. A disc has few
+arcs, so that only all discs of a photograph together can show variances below those of independent
+pixels. That happens where JPEG has compressed the photograph in blocks of 8 × 8 pixels: scores are
+summed over these blocks, too.
 """
 
 from __future__ import annotations
@@ -26,50 +27,57 @@ from kgcp.measurement.image_model.residual_agreement import sums_over_arcs
 
 _ARC_PX = 6.0
 _FEWEST_ARCS = 8
-_BLOCK_PX, _FEWEST_BLOCKS = 8, 40.0  # of JPEG; in all discs of a photograph
-_ARCS_IN_COMMON = 40.0  # what all discs of a photograph scatter counts like so many arcs
-_LEAST_LEFT, _NEARLY_NONE = 1.0, 1e-6  # of the scatter, after the fit
-_OUTLYING_RATIO = 3.0  # of the median; larger ratios are those of single discs
+# JPEG's blocks, and how many of them all discs of a photograph must have
+_BLOCK_PX, _FEWEST_BLOCKS = 8, 40.0
+_ARCS_OF_PHOTOGRAPH = 40.0  # weight, in arcs, of the ratio of all discs against that of one disc
+_LEAST_SCATTER_LEFT, _NEARLY_NONE = 1.0, 1e-6  # least scatter that a fit leaves
+_OUTLYING_RATIO = 3.0  # times the median; larger ratios are those of single discs, and are cut
 _LEAST_FACTOR = 0.25  # of variances, as for coded targets
-# Variances of ratios that independent residuals show, by one arc, by one block and by one pixel of
-# an edge
+# Variances by chance of a ratio of 1: from one arc, from one block, and from one pixel of an edge
 _ARC_VARIANCE, _BLOCK_VARIANCE, _PIXEL_VARIANCE = 2.0, 1.5, 2.5
-# Of centre and edge, whatever the noise; 0.0005 px made deviations of simulated discs of R 60 px
-# up to 15 % too large.
+# Least standard deviation of centre and edge, whatever the noise. With 0.0005 px, deviations of
+# simulated discs of R 60 px were up to 15 % too large.
 _FLOOR_PX = 0.0002
-_COMMON_SHARE = 0.25  # where edges scatter more than noise makes them, so much of it, …
-_EXTRAPOLATED_SHARE = 0.025  # … and so much of how far they are beyond what is not clipped
-# By how much of the blur the camera may displace all edges alike, as standard deviations, from the
-# cases named of `benchmarks.calibrate.operator`. An unknown curve that three parameters do not hold
-# does it by 0.05 to 0.13 px where σ is 0.67 px (`unknown_film`). If discs are too few to show that
-# a curve is bent, it is known no better.
-_OF_UNKNOWN_CURVE = 0.15
-# Compression of quality 92 and 85 does it by 0.02 to 0.06 px, and where white is burnt by 0.05 and
-# 0.18 px (`srgb_jpeg`, `clipped_jpeg`). A curve that could bend in each disc would take it up
-# instead, and displace centres where the light falls off: by 0.005 px at R 150 px, 1.9 deviations.
-_OF_COMPRESSION, _OF_COMPRESSION_OF_BURNT = 0.08, 0.3
-# Out of focus, the point spread has more to it than a kurtosis. The half of an edge that is not
-# burnt shows it as a displacement of 0.035 to 0.08 px where σ is 1.2 px (`defocused_clipped`).
-_OUT_OF_FOCUS_AND_BURNT = 0.04
-# Of what compression or an unknown tone curve may displace all edges by, so much is left of a ring
-# that is measured as a whole, whose edges tell it: of the 0.1 px of a bent curve 0.007 px, where a
-# film's leaves 0.012 px and sRGB's 0.001 px. Edges nearer to each other than so many px, or
-# standard deviations of the blur, tell it wrongly: by a film's curve distances were off by 3 % at R
-# 2.5 px and by 1.1 % at 3 px.
-_LEFT_OF_RING, _LEAST_GAP_PX, _LEAST_GAP = 1.0 / 15.0, 1.9, 3.0
-# Where the light falls off, a bent curve displaces opposite edges differently: of the blur, for
-# light that falls off by all of itself over one radius. What discs had in common in ten draws of
-# photographs was half of this (R 8 and 15 px), and twice this for one case of twelve.
-_TONED_FALL = 0.05
+# Share of the scatter of edges beyond the noise that a whole edge may have in common, and share of
+# the distance over which the place of a clipped edge is extrapolated
+_COMMON_SHARE = 0.25
+_EXTRAPOLATED_SHARE = 0.025
+# The following are standard deviations of a displacement of all edges alike by the camera, as
+# shares of the blur. They are from the named cases of `benchmarks.calibrate.operator`.
+#
+# An unknown curve has more than three parameters can describe. It displaces edges by 0.05 to 0.13
+# px where the blur is 0.67 px (`unknown_film`). That also counts if the discs are too few to show
+# whether the curve is bent.
+_BY_UNKNOWN_CURVE = 0.15
+# Compression of quality 92 and 85 displaces edges by 0.02 to 0.06 px, and where white is burnt by
+# 0.05 and 0.18 px (`srgb_jpeg`, `clipped_jpeg`). If the curve could bend in each disc instead, it
+# would take that up, but displace centres where the light falls off: by 0.005 px at R 150 px, 1.9
+# deviations.
+_BY_COMPRESSION, _BY_COMPRESSION_OF_BURNT = 0.08, 0.3
+# Out of focus, the shape of the point spread is more than a kurtosis. Burnt edges, of which only
+# one half is seen, are displaced by that: by 0.035 to 0.08 px where the blur is 1.2 px
+# (`defocused_clipped`).
+_BY_DEFOCUS_OF_BURNT = 0.04
+# A ring that is measured as a whole tells a displacement of all its edges, and this share of the
+# above is left: 0.007 px of the 0.1 px of an unknown curve. (In simulations, film's curve leaves
+# 0.012 px and sRGB's 0.001 px.) Edges that are nearer to each other than this, in pixels or in
+# blurs, tell it wrongly: with film's curve, distances were off by 3 % at R 2.5 px and by 1.1 % at 3
+# px.
+_SHARE_LEFT_OF_RING, _LEAST_GAP_PX, _LEAST_GAP = 1.0 / 15.0, 1.9, 3.0
+# Where the light falls off, a bent curve displaces opposite edges differently, and with them the
+# centre. Its standard deviation is this share of the blur, times the relative change of the light
+# over one radius. In ten draws of photographs, the displacement that discs had in common was half
+# of this (R 8 and 15 px), and twice this in one case of twelve.
+_BY_CURVE_PER_FALL = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class BlockScatter:
     """The scatter of one disc's scores over JPEG's blocks."""
 
-    ratio: float  # mean ratio to that of independent residuals
-    expected: float  # the latter scatter, after the fit: little, if there are few blocks
-    count: float  # how many blocks of equal weight would tell as much
+    ratio: float  # mean ratio to the scatter of independent residuals
+    expected: float  # that scatter, after the fit; it is small if there are few blocks
+    count: float  # number of blocks of equal weight that would tell as much
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,11 +85,11 @@ class DiscScatter:
     """What the residuals of one disc say of its covariance."""
 
     independent: FloatArray  # (5, 5): of centroid [px] and moments [px²], for independent residuals
-    common: FloatArray  # (5, 5): what an edge displaced as a whole adds, and the floor
+    common: FloatArray  # (5, 5): added for displacements of the whole edge, and the floor
     ratio: float  # mean ratio of the scatter of scores to that of independent residuals
-    arcs: int  # that it was found from
+    arcs: int  # number of arcs that it was found from
     over_blocks: BlockScatter
-    is_noise_alone: bool  # nothing is clipped, and light is linear
+    is_noise_alone: bool  # whether nothing is clipped, and the light is linear
 
     def cov(self, inflation: float) -> FloatArray:
         """Return the covariance (5, 5) for an inflation of the independent part."""
@@ -91,7 +99,7 @@ class DiscScatter:
 def scatter_of(fit: DiscFit) -> DiscScatter:
     """Return the parts of the covariance of centroid and second moments.
 
-    Of a fit that `check_disc_fit` accepts: one with enough redundancy.
+    The fit must be one that `check_disc_fit` accepts, with enough redundancy.
     """
     scaled, inverse = fit.scaled, np.linalg.inv(fit.normal).astype(np.float64)
     own = inverse[:GEOMETRY_COUNT]
@@ -106,24 +114,24 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
     shares = np.einsum("bkp,kp->b", products, to_own)
     equal = float(shares.sum() ** 2 / np.sum(shares * shares))
     over_blocks = BlockScatter(float(np.sum(sums * sums)) / expected, expected, equal)
-    if _edges_tell_displacement(fit):  # then `RingUnknowns` has what that does
-        common_px = max(_FLOOR_PX, _LEFT_OF_RING * _of_camera_px(fit))
+    if _edges_tell_displacement(fit):  # `RingUnknowns` allows for the displacement itself
+        common_px = max(_FLOOR_PX, _SHARE_LEFT_OF_RING * _camera_displacement_px(fit))
     else:
         common_px = common_displacement_px(fit)
-    # an edge that is displaced everywhere grows both semi-axes alike: M by the identity
+    # an edge that is displaced everywhere alike changes M by a multiple of the identity
     grown = np.array((0.0, 0.0, 1.0, 0.0, 1.0)) * common_px
     common = np.outer(grown, grown) + np.diag([_FLOOR_PX**2] * GEOMETRY_COUNT)
     if fit.free.tone.is_shaped:
-        aside_px = _TONED_FALL * fit.state.blur.mean_sd_px * fit.state.slope
-        common[:2, :2] += np.outer(aside_px, aside_px)
-    bent_px = _bend_px(fit)
-    common[:2, :2] += bent_px @ bent_px
+        by_curve_px = _BY_CURVE_PER_FALL * fit.state.blur.mean_sd_px * fit.state.slope
+        common[:2, :2] += np.outer(by_curve_px, by_curve_px)
+    by_curved_light_px = _curved_light_displacement_px(fit)
+    common[:2, :2] += by_curved_light_px @ by_curved_light_px
     to_moments = moments_by_stretch(fit.state.geometry)
-    # errors over deviations of a noise that is estimated are distributed as Student's t
+    # with an estimated noise, errors over deviations are distributed as Student's t
     freedom = fit.noise_freedom
-    of_noise = freedom / (freedom - 2.0)
+    t_variance = freedom / (freedom - 2.0)
     return DiscScatter(
-        of_noise * (to_moments @ own[:, :GEOMETRY_COUNT] @ to_moments.T),
+        t_variance * (to_moments @ own[:, :GEOMETRY_COUNT] @ to_moments.T),
         to_moments @ common @ to_moments.T,
         ratio,
         arcs,
@@ -135,44 +143,45 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
 def scatter_ratio(
     sums: FloatArray, products: FloatArray, to_own: FloatArray, inverse: FloatArray
 ) -> float:
-    """Return the scatter of the arcs' scores over the one that the model expects.
+    """Return the scatter of the arcs' scores relative to that of independent residuals.
 
     Parameters
     ----------
     sums : (arcs, 5) array
-        Scores of every arc, as they move the ellipse.
+        Gradient of every arc, propagated to the ellipse: `to_own` times it.
     products : (arcs, 5, p) array
-        Normal matrices A of the arcs, of which the rows are carried to the ellipse in the same way.
+        `to_own` times the normal matrix A of every arc.
     to_own : (5, p) array
-        What carries them: the rows of the ellipse in N⁻¹, in units of their own root.
+        Rows of the ellipse in N⁻¹, in units of the root of its own part.
     inverse : (p, p) array
         N⁻¹, of all arcs and the priors.
     """
-    left = _scatter_left(products, to_own, inverse)
-    return float(np.sum(sums * sums)) / max(left, _LEAST_LEFT)
+    scatter_left = _scatter_left(products, to_own, inverse)
+    return float(np.sum(sums * sums)) / max(scatter_left, _LEAST_SCATTER_LEFT)
 
 
 def _scatter_left(products: FloatArray, to_own: FloatArray, inverse: FloatArray) -> float:
-    """Return the scatter of scores that a fit leaves of residuals as expected.
+    """Return the scatter of scores that a fit leaves of independent residuals.
 
-    Of an arc whose normal matrix is A, it leaves A − A N⁻¹ A.
+    On an arc whose normal matrix is A, a fit leaves A − A N⁻¹ A.
     """
     return float(np.sum(products.sum(axis=0) * to_own) - np.sum((products @ inverse) * products))
 
 
 def inflations(scatters: Sequence[DiscScatter]) -> FloatArray:
-    """Return what to multiply the covariances (n,) of the discs of one photograph with.
+    """Return the factors (n,) of the covariances of the discs of one photograph.
 
-    The ratio of one disc is uncertain, and that of a photograph is not: compression and jagged
-    print are the same for all. Each disc's own ratio counts like its arcs, the photograph's like
-    forty. What may be above 1 by chance is taken off: a disc alone has eight arcs or a few more.
+    The ratio of one disc is uncertain. That of a photograph is not, and compression and jagged
+    print are the same for all its discs. So each disc's own ratio counts with the number of its
+    arcs, and the photograph's like forty arcs. What exceeds 1 by chance is taken off: a single disc
+    has only eight arcs or a few more.
 
     A factor is below 1 if the whole photograph shows that, beyond chance. Compression and a
-    camera's denoising leave residuals that cancel each other over neighbouring pixels: by JPEG of
-    quality 92, the squared scatter of blocks is 0.5 to 0.75 of what independent residuals would
-    leave, and squared errors are smaller in the same way. It does not hold for burnt discs, whose
-    levels are known beforehand rather than by residuals, nor for discs at the edge of a shadow,
-    whose residuals are not those of noise.
+    camera's denoising leave residuals that cancel each other over neighbouring pixels. With JPEG of
+    quality 92, the squared scatter over blocks is 0.5 to 0.75 of that of independent residuals, and
+    squared errors are smaller by the same factor. This does not hold for burnt discs, whose levels
+    are known beforehand rather than from residuals, nor for discs at the edge of a shadow, whose
+    residuals are not only noise.
     """
     if not scatters:
         return np.empty(0)
@@ -180,21 +189,22 @@ def inflations(scatters: Sequence[DiscScatter]) -> FloatArray:
     ratios = np.array([each.ratio for each in scatters])
     arcs = np.array([each.arcs for each in scatters], dtype=np.float64)
     ratios[is_noise_alone] *= _blocks_over_arcs([each for each in scatters if each.is_noise_alone])
-    in_common = _typical(ratios)
-    of_chance = np.array(_ARC_VARIANCE / arcs.sum())
-    shown = max(1.0 - float(beyond_chance(np.array(1.0 - in_common), of_chance)), _LEAST_FACTOR)
+    of_photograph = _typical(ratios)
+    chance = np.array(_ARC_VARIANCE / arcs.sum())
+    shown = max(1.0 - float(beyond_chance(np.array(1.0 - of_photograph), chance)), _LEAST_FACTOR)
     least = np.where(is_noise_alone, shown, 1.0)
-    weight = arcs + _ARCS_IN_COMMON
-    pooled = (arcs * ratios + _ARCS_IN_COMMON * in_common) / weight
-    shared = _ARCS_IN_COMMON * (2.0 * arcs + _ARCS_IN_COMMON) / arcs.sum()
+    weight = arcs + _ARCS_OF_PHOTOGRAPH
+    pooled = (arcs * ratios + _ARCS_OF_PHOTOGRAPH * of_photograph) / weight
+    shared = _ARCS_OF_PHOTOGRAPH * (2.0 * arcs + _ARCS_OF_PHOTOGRAPH) / arcs.sum()
     return least + beyond_chance(pooled - least, _ARC_VARIANCE * (arcs + shared) / weight**2)
 
 
 def _blocks_over_arcs(scatters: Sequence[DiscScatter]) -> float:
-    """Return the scatter over JPEG's blocks as a share of that over arcs; 1 if none was compressed.
+    """Return the ratio over JPEG's blocks divided by that over arcs; at most 1.
 
-    Errors of compression cancel each other over a block, and less so over arcs of edges, which are
-    not along its borders. A few discs do not tell it.
+    Errors of compression cancel each other over a block, and less so over arcs of edges, which do
+    not follow the blocks' borders. It is 1 without compression, and if the discs are too few to
+    tell.
     """
     blocks = [each.over_blocks for each in scatters]
     count = sum(each.count for each in blocks)
@@ -203,22 +213,22 @@ def _blocks_over_arcs(scatters: Sequence[DiscScatter]) -> float:
     weights = np.array([each.expected for each in blocks])
     over_blocks = _typical(np.array([each.ratio for each in blocks]), weights)
     over_arcs = _typical(np.array([each.ratio for each in scatters]))
-    of_chance = np.array(_BLOCK_VARIANCE / count)
-    return 1.0 - float(beyond_chance(np.array(1.0 - over_blocks / over_arcs), of_chance))
+    chance = np.array(_BLOCK_VARIANCE / count)
+    return 1.0 - float(beyond_chance(np.array(1.0 - over_blocks / over_arcs), chance))
 
 
 def _typical(ratios: FloatArray, weights: FloatArray | None = None) -> float:
-    """Return the mean of ratios (n,), of which single discs' may be far above."""
+    """Return the mean of ratios (n,), with those of single discs that are far above it cut."""
     usual = np.minimum(ratios, _OUTLYING_RATIO * np.median(ratios))
     return float(np.average(usual, weights=weights))
 
 
 def beyond_chance(excess: FloatArray, variance: FloatArray) -> FloatArray:
-    """Return what excesses (n,) are beyond those that chance makes of none; ≥ 0.
+    """Return excesses (n,), reduced by what chance alone makes of an excess of 0; at least 0.
 
-    As the estimator of James and Stein: large ones stay as they are. Of chance alone 0.13 standard
-    deviations are left in the mean. If only those below 0 were cut off, 0.4 would be: variances of
-    a disc alone would be 16 % too large.
+    As with the estimator of James and Stein, large excesses stay as they are. Of chance alone, 0.13
+    standard deviations are left in the mean. If negative excesses were merely set to 0, it would be
+    0.4, and variances of a single disc would be 16 % too large.
     """
     return np.maximum(excess - variance / np.maximum(excess, 1e-12), 0.0)
 
@@ -236,10 +246,11 @@ def moments_by_stretch(geometry: Geometry) -> FloatArray:
 
 
 def common_displacement_px(fit: DiscFit) -> float:
-    """Return the standard deviation of the displacement that all of the edge shares [px].
+    """Return the standard deviation of the displacement that the whole edge has in common [px].
 
-    As of coded targets: from what edges scatter beyond the noise of the plateaus, and beyond what
-    so few pixels do by chance, and from how far the middle of the edge is within what is clipped.
+    As for coded targets, it follows from how much edges scatter beyond the noise of the plateaus
+    (here less what so few pixels do by chance), and from how deep the middle of the edge lies in
+    the clipped part. The camera's displacement counts, too.
     """
     noise, blur_px = fit.noise, fit.state.blur.mean_sd_px
     state, tone, limits = fit.state, fit.free.tone, fit.sample.censoring
@@ -249,33 +260,35 @@ def common_displacement_px(fit: DiscFit) -> float:
     at_edges = median_at_edges(excess, fit.share, 0.3, 0.7, 0.0)
     black, white = state.plateaus(tone)
     slope_per_px = (white - black) / (math.sqrt(2.0 * math.pi) * blur_px)
-    burnt, sunk = state.share_at(limits.high, tone), state.share_at(limits.low, tone)
-    hidden = max(0.5 - burnt, sunk - 0.5, 0.0)
+    at_high, at_low = state.share_at(limits.high, tone), state.share_at(limits.low, tone)
+    hidden = max(0.5 - at_high, at_low - 0.5, 0.0)
     reach_px = blur_px * float(ndtri(min(0.5 + hidden, 1.0 - 1e-3)))
-    of_edges_px = _COMMON_SHARE * math.sqrt(max(at_edges, 0.0)) / slope_per_px
-    return max(_FLOOR_PX, _EXTRAPOLATED_SHARE * reach_px, of_edges_px, _of_camera_px(fit))
+    by_scatter_px = _COMMON_SHARE * math.sqrt(max(at_edges, 0.0)) / slope_per_px
+    return max(
+        _FLOOR_PX, _EXTRAPOLATED_SHARE * reach_px, by_scatter_px, _camera_displacement_px(fit)
+    )
 
 
-def _of_camera_px(fit: DiscFit) -> float:
-    """Return by how much the camera may displace all edges alike, as standard deviation [px].
+def _camera_displacement_px(fit: DiscFit) -> float:
+    """Return the standard deviation of a displacement of all edges by the camera [px].
 
-    Compression takes as much from both sides of an edge, unless a curve or burnt white makes them
-    differ. Where all is burnt, clipped values that are smeared show that there was compression.
+    Compression changes both sides of an edge alike, and does not displace it, unless a curve or
+    burnt white makes the sides differ. On burnt ground, smeared clipped values show compression.
     """
     free, limits = fit.free, fit.sample.censoring
-    of_curve = _OF_UNKNOWN_CURVE if free.is_curve_unknown else 0.0
-    of_compression = of_focus = 0.0
+    by_curve = _BY_UNKNOWN_CURVE if free.is_curve_unknown else 0.0
+    by_compression = by_defocus = 0.0
     if fit.sample.is_burnt:
-        of_focus = _OUT_OF_FOCUS_AND_BURNT if free.kurtosis else 0.0
+        by_defocus = _BY_DEFOCUS_OF_BURNT if free.kurtosis else 0.0
         is_smeared = math.isfinite(limits.ceiling) or math.isfinite(limits.floor)
-        of_compression = _OF_COMPRESSION_OF_BURNT * (free.is_compressed or is_smeared)
+        by_compression = _BY_COMPRESSION_OF_BURNT * (free.is_compressed or is_smeared)
     elif free.tone is not Tone.LINEAR:
-        of_compression = _OF_COMPRESSION * free.is_compressed
-    return math.hypot(of_curve, of_compression, of_focus) * fit.state.blur.mean_sd_px
+        by_compression = _BY_COMPRESSION * free.is_compressed
+    return math.hypot(by_curve, by_compression, by_defocus) * fit.state.blur.mean_sd_px
 
 
 def _edges_tell_displacement(fit: DiscFit) -> bool:
-    """Tell whether a ring's edges are far enough apart to show how far ink spreads over them."""
+    """Tell whether a ring's edges are far enough apart to show how far all are displaced."""
     pixels, state = fit.sample.pixels, fit.state
     if not len(pixels.inner):
         return False
@@ -283,18 +296,19 @@ def _edges_tell_displacement(fit: DiscFit) -> bool:
     return gap_px > max(_LEAST_GAP_PX, _LEAST_GAP * state.blur.mean_sd_px)
 
 
-def _bend_px(fit: DiscFit) -> FloatArray:
-    """Return by how much light beyond second order may displace the centre (2, 2) [px].
+def _curved_light_displacement_px(fit: DiscFit) -> FloatArray:
+    """Return how far light beyond second order may displace the centre (2, 2) [px].
 
-    The step of a shadow has all orders. The next ones count as much as the second: a relative
-    change of the light, over the margin that is used, displaces edges by so much of the blur.
+    The step of a shadow has all orders. The higher orders together count like the second: by as
+    much as it changes the light over the margin that is used, relatively, edges may be displaced in
+    units of the blur.
     """
     blur = fit.state.blur
     return blur.mean_sd_px * outward_px(blur) ** 2 * fit.light_curvature
 
 
 def _arcs(fit: DiscFit) -> IndexArray:
-    """Return the number (n,) of the arc that every pixel is at."""
+    """Return the number (n,) of the arc that every pixel belongs to."""
     geometry, places = fit.state.geometry, fit.sample.pixels.places_px
     stretch = geometry[[2, 3, 3, 4]].reshape(2, 2)
     u, v = np.linalg.solve(stretch, places - geometry[:2, None])
@@ -305,7 +319,7 @@ def _arcs(fit: DiscFit) -> IndexArray:
 
 
 def _blocks(fit: DiscFit) -> IndexArray:
-    """Return the number (n,) of the block that every pixel is in, if the photograph is whole."""
+    """Return the number (n,) of every pixel's JPEG block, if the photograph was not cropped."""
     columns, rows = fit.sample.pixels.places_px.astype(np.intp) // _BLOCK_PX
     numbers = rows * (fit.sample.window.frame_px // _BLOCK_PX + 1) + columns
     return np.unique(numbers, return_inverse=True)[1]

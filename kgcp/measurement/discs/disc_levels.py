@@ -1,7 +1,7 @@
 """From the white share of a disc's pixels to their grey values, with derivatives.
 
-Light falls off over the scene, ink and ground alike, and the camera's tone curve and its sharpening
-follow. The tone curve is a lookup: powers would take most of the time.
+The light falls off over the scene, on ink and ground alike. The camera's tone curve and its
+sharpening follow. sRGB's curve is a lookup table: powers would take most of the time.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from kgcp.measurement.image_model.srgb import srgb_encoded, srgb_slope
 
 
 class Row(IntEnum):
-    """Rows of the Jacobian, and of a disc's vector; its centre and stretch take 0…4 [px]."""
+    """Rows of the Jacobian, and of a disc's vector. Rows 0…4 are its centre and stretch [px]."""
 
     BLUR_MEAN = 5  # (xx + yy)/2 [px²]
     BLUR_DIFFERENCE = 6  # (xx − yy)/2 [px²]
     BLUR_XY = 7  # [px²]
     BLACK = 8  # light of the darker level, 1 at full scale
-    WHITE = 9
-    SLOPE_X = 10  # of the light, per radius
+    WHITE = 9  # light of the brighter level
+    SLOPE_X = 10  # relative change of the light per radius
     SLOPE_Y = 11
     WAVE_1 = 12  # of the tone curve
     WAVE_2 = 13
     WAVE_3 = 14
     SHARPENING = 15  # strength of the unsharp mask
-    INK_SLOPE_X = 16  # of the darker level alone, of the contrast per radius
+    INK_SLOPE_X = 16  # change of the darker level alone, in contrasts per radius
     INK_SLOPE_Y = 17
     CURVE_XX = 18  # second order of the light, per square of the radius
     CURVE_XY = 19
@@ -58,7 +58,7 @@ class LevelModel:
 
     offsets: FloatArray  # (2, n): from the disc's middle, in radii
     tone: Tone
-    mask: Mask | None  # of the camera's sharpening; None: it does not sharpen
+    mask: Mask | None  # unsharp mask of the camera; None: it does not sharpen
 
     def linearised(self, share: WhiteShare, vector: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the grey values (n,) before clipping and their Jacobian (21, n).
@@ -95,9 +95,10 @@ class LevelModel:
         beside: FloatArray,
         vector: FloatArray,
     ) -> tuple[FloatArray, FloatArray]:
-        """Return grey values and Jacobian after the mask; the latter is changed in place.
+        """Return grey values and Jacobian after the mask; the Jacobian is changed in place.
 
-        Pixels that are not modelled are ink or plate, and change with all that those depend on.
+        Pixels within the mask that are not adjusted are taken for ink or plate. They change with
+        all that these levels depend on.
         """
         strength, (ink, plate, by_ink, by_plate) = vector[Row.SHARPENING], beside[:4]
         x, y = self.offsets
@@ -109,8 +110,8 @@ class LevelModel:
         black, white = vector[Row.BLACK], vector[Row.WHITE]
         falling = others_ink * by_ink * black + others_plate * by_plate * white
         jacobian[Row.SLOPE_X : Row.WAVE_1] -= falling * self.offsets
-        # where there is no second order, its rows only tell whether to ask for it: errors of a few
-        # per cent do no harm
+        # if the second order is 0, its rows only serve the test whether it is needed: errors of a
+        # few per cent do no harm
         if vector[CURVES].any():
             for row, curve in zip(CURVES, curves, strict=True):
                 jacobian[row] += strength * mask.detail(jacobian[row], 0.0, 0.0) - falling * curve
@@ -147,7 +148,7 @@ def _looked_up(light: float, table: FloatArray) -> tuple[float, float]:
 
 @inlined
 def _waves(known: float) -> tuple[float, float, float, float, float, float]:
-    """Return three waves at a grey value, and their slopes; beyond 0…1 they go on straight."""
+    """Return three waves at a grey value, and their slopes; beyond 0…1 waves are straight lines."""
     within = min(max(known, 0.0), 1.0)
     sine, cosine = np.sin(np.pi * within), np.cos(np.pi * within)
     slope_2, slope_3 = 2.0 * cosine * cosine - 1.0, cosine * (4.0 * cosine * cosine - 3.0)
@@ -174,10 +175,10 @@ def _expose(
     jacobian: FloatArray,
     beside: FloatArray,
 ) -> None:
-    """Fill in grey values (n,), Jacobian (21, n), and the levels about every pixel.
+    """Fill in grey values (n,), Jacobian (21, n), and the levels around every pixel.
 
-    These are, where there is room for them (10, n): of ink and plate; their derivatives by the
-    light of each, and by the waves.
+    The latter, `beside`, has 10 rows, or no columns if they are not needed: grey values of ink and
+    of plate, the derivatives of each by its light, and those of each by the three waves.
     """
     is_srgb, is_shaped = of_tone
     black, white, slope_x, slope_y = vector[8], vector[9], vector[10], vector[11]

@@ -1,6 +1,6 @@
-"""Edge points of many ellipses at once: the steepest slope of the right sign along each ray.
+"""Edge points around many ellipses at once: the steepest slope of the right sign along each ray.
 
-Rays start at an ellipse's centre and are straight in the frame in which it is the unit circle.
+Rays start at an ellipse's centre. Their directions are evenly spaced where it is the unit circle.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
 
 RAYS = 48
 _STEP_PX = 0.5  # between samples
-_SLOPE_STEPS = 2  # samples either side that a slope is taken over
+_SLOPE_STEPS = 2  # a slope is taken over so many samples on either side
 _MOST_SAMPLES = 64
 _ANGLES = 2.0 * np.pi / RAYS * np.arange(RAYS)
 DIRECTIONS = np.stack((np.cos(_ANGLES), np.sin(_ANGLES)), axis=-1)
@@ -42,7 +42,7 @@ def sample_edges(
     reach_px : (n,) array
         How far from the ellipse edges are looked for.
     edges : (n, rays) array
-        Receives the distances from the centre, in units of the ellipse.
+        Receives the edges' distances from the centre, in units of the ellipse.
     strengths : (n, rays) array
         Receives the slopes times the sign [grey values per pixel]; 0 beyond the image's border.
     levels : (n, 2, rays) array
@@ -98,7 +98,8 @@ def _sample(
 def _steepest(values: FloatArray, sign: float) -> tuple[float, float, float, float]:
     """Return the steepest place between samples, the slope, and the levels on either side of it.
 
-    The levels are those where the values stop to fall and to rise.
+    The levels are the values where the slope ends: the first samples, inwards and outwards, beyond
+    which the values no longer fall or rise.
     """
     count, best, steepest = len(values), _SLOPE_STEPS, 0.0
     for j in range(_SLOPE_STEPS, count - _SLOPE_STEPS):
@@ -129,7 +130,7 @@ def mark_inliers(
     inlying: BoolArray,
     residual_px: FloatArray,
 ) -> None:
-    """Mark edges near fitted ellipses, and fill in the root mean square of their distances.
+    """Mark edges near fitted ellipses, and fill in their RMS distance from these.
 
     Parameters
     ----------
@@ -138,7 +139,7 @@ def mark_inliers(
     fitted : (n, 5) array
         By `fit_ellipses` in the frame of the ellipse: centre, semi-axes, direction.
     limits_px : (n,) array
-        Distance of what counts.
+        Largest distance of an edge that counts.
     """
     for i in range(len(edges)):
         x, y, a, b, angle = fitted[i]

@@ -27,24 +27,27 @@ from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.image_model.sharpening import Mask, unsharp_mask
 from kgcp.measurement.image_model.srgb import srgb_decoded, srgb_slope
 
-MUCH_CLIPPED = 0.05  # share of pixels, above which a level is hardly seen
-SHARPENING_PX = 1.0  # σ of a camera's unsharp mask, until more is known
+MUCH_CLIPPED = 0.05  # largest share of clipped pixels at which both levels are well seen
+SHARPENING_PX = 1.0  # σ of a camera's unsharp mask, until it is learned
 _MIN_VARIANCE_PX2 = 0.075  # a pixel alone spreads by 1/12 px²
 _MAX_ANISOTROPY = 0.95
 _STEPS = 12
-_ENOUGH = 0.02  # of log-likelihood, promised by a step
-_LITTLE = 1e-4  # of a step
+_LEAST_PROMISE = 0.02  # a step that promises a smaller gain in log-likelihood is not taken
+_SMALL_SHARE = 1e-4  # of a step, for a numerical derivative along it
 _NOISE_ROUNDS, _SETTLED_NOISE = 8, 0.02
-_LEAST_RESIDUAL_SHARE = 0.25  # of a pixel's variance, that a fit leaves in its residual
-_LEAST_FREEDOM = 8.0  # of the noise of an edge; with less, deviations of R 3 px were 10 % too large
-_CLIP_SIGMAS = 2.5  # a pixel whose model is nearer to a clipping limit tells nothing of the noise
+_LEAST_RESIDUAL_SHARE = 0.25  # of a pixel's variance that its residual is taken to have, at least
+# Least degrees of freedom of the noise of an edge; with less, deviations at R 3 px were 10 % too
+# large.
+_LEAST_FREEDOM = 8.0
+_CLIP_SIGMAS = 2.5  # pixels modelled nearer to a clipping limit are not used for the noise
 _FEWEST_OF_NOISE = 8  # pixels
-# Of the range between the limits. Beyond, residuals are not noise but what the model lacks: a wider
-# margin would leave only edges, and these would make it larger still.
+# Largest margin to the clipping limits, as a share of the range between them. If it is reached,
+# residuals are not noise but show what the model lacks. A wider margin would leave only pixels at
+# edges, and these would make the noise, and the margin, larger still.
 _MOST_MARGIN = 0.1
 _DAMPING, _DAMPED, _MOST_DAMPING = 1e-6, 1e-3, 1e6
 
-# Independent normal priors of what a disc alone hardly tells; lengths in radii.
+# Independent normal priors of parameters that one disc hardly tells; lengths in radii.
 _PRIOR_SD = {
     Row.BLUR_DIFFERENCE: 0.3,  # px²
     Row.BLUR_XY: 0.3,
@@ -57,23 +60,27 @@ _PRIOR_SD = {
     Row.INK_SLOPE_X: 0.05,
     Row.INK_SLOPE_Y: 0.05,
 }
-_SHADOW_SLOPE_SD = 0.3  # of the light per radius, where the edge of a shadow crosses the disc, …
-_SHADOW_CURVE_SD = 0.2  # … and of its second order
-# Strengths of a camera's unsharp mask; below 0 stand the skirts of a point spread. Burnt discs, of
-# whose edges little is seen, would go to 3 and take their blur along.
+# Priors of the light's first and second order where the edge of a shadow crosses the disc
+_SHADOW_SLOPE_SD = 0.3
+_SHADOW_CURVE_SD = 0.2
+# Least and largest strength of a camera's unsharp mask; negative ones stand for the skirts of a
+# point spread. Burnt discs show little of their edges, and would go to 3 and take their blur along.
 _SHARPENINGS = (-0.5, 1.5)
-_FALL = 0.7  # of the light, from the middle of a photograph to its end
-_WHITE, _WHITE_SD = 1.0, 0.4  # burnt levels of unknown tone: lest level and tone drift together
+_FALL = 0.7  # standard deviation of the change of light from a photograph's middle to its end
+_WHITE, _WHITE_SD = (
+    1.0,
+    0.4,
+)  # prior of burnt white with an unknown tone: else the two drift together
 _ALWAYS = (*range(GEOMETRY_COUNT), Row.BLUR_MEAN, Row.BLUR_DIFFERENCE, Row.BLUR_XY)
 _LIGHT = (Row.BLACK, Row.WHITE, Row.SLOPE_X, Row.SLOPE_Y)
 _SLOPES = np.array((Row.SLOPE_X, Row.SLOPE_Y))
 _WAVES = (Row.WAVE_1, Row.WAVE_2, Row.WAVE_3)
 _INK_SLOPES = (Row.INK_SLOPE_X, Row.INK_SLOPE_Y)
-# what is estimated besides at the edge of a shadow
+# additional unknowns at the edge of a shadow
 _UNEVEN = np.array((*_INK_SLOPES, *CURVES.tolist()))
 _UNEVEN_PRECISIONS = np.array([_SHADOW_SLOPE_SD] * 2 + [_SHADOW_CURVE_SD] * 3) ** -2.0
 CAMERA_ROWS = (*_WAVES, Row.SHARPENING)
-"""What all discs share: the camera's tone curve and sharpening."""
+"""The parameters that all discs share: the camera's tone curve and sharpening."""
 
 
 class NoFit(Exception):  # noqa: N818 - the outcome of one disc
@@ -103,10 +110,10 @@ class DiscUnknowns:
     rows: IndexArray  # (p,): the free parameters
     mean: FloatArray  # (21,)
     precision: FloatArray  # (21, 21); zeros: nothing is known
-    is_tone_stated: bool  # or it is one to start from
-    kurtosis: float = 0.0  # excess of the point spread's, which is known
-    is_curve_unknown: bool = False  # what is known of it is learned from discs, or from none
-    is_compressed: bool = False  # the photograph
+    is_tone_stated: bool  # whether the tone is the camera's, or one to start from
+    kurtosis: float = 0.0  # known excess kurtosis of the point spread
+    is_curve_unknown: bool = False  # whether the tone curve is learned from discs
+    is_compressed: bool = False  # whether the photograph is a JPEG, or was one
 
     @classmethod
     def of(
@@ -126,7 +133,7 @@ class DiscUnknowns:
         Parameters
         ----------
         camera : ProcessingPrior
-            What other discs show of tone and sharpening; None: what is known of any camera.
+            What is learned of tone and sharpening; None: what is known of any camera.
         sharpening_px : float
             σ of the camera's unsharp mask [px]; 0: it does not sharpen.
         has_ink_slope : bool
@@ -134,9 +141,9 @@ class DiscUnknowns:
         is_tone_stated : bool
             Whether the tone is the camera's, or one to start from.
         kurtosis : float
-            Excess of that of the camera's point spread.
+            Excess kurtosis of the camera's point spread.
         is_curve_unknown : bool
-            Whether the tone is learned from discs.
+            Whether the tone curve is learned from discs.
         is_compressed : bool
             Whether the photograph is a JPEG, or was one.
         """
@@ -179,20 +186,21 @@ class DiscUnknowns:
     def with_curved_light(self) -> DiscUnknowns:
         """Return the unknowns of a disc at the edge of a shadow: light of second order.
 
-        The darker level gets a gradient of its own, whatever the disc's size: a step through the
-        middle has no second order, and an odd one displaces the centre.
+        The darker level gets a gradient of its own, too, whatever the disc's size: a step of the
+        light through the middle of a disc has no second order, and would displace the centre.
         """
         precision = self.precision.copy()
         precision[_UNEVEN, _UNEVEN] = _UNEVEN_PRECISIONS
         return replace(self, rows=np.union1d(self.rows, _UNEVEN), precision=precision)
 
     def in_light(self, radius_px: float, frame_px: int, *, is_burnt: bool) -> DiscUnknowns:
-        """Return the unknowns of a disc of some size in a photograph of some size.
+        """Return the unknowns with priors for the size of a disc, and for burnt ground.
 
-        Light falls off over a photograph, and so by little over a small disc. Where the ground is
-        burnt, nothing else keeps its gradient from explaining whatever makes opposite edges differ.
-        Where nothing is burnt, the level of white is seen: what is usual of it, said by each of
-        many discs, would bend the curve that they share.
+        The light falls off over a photograph, and so by little over a small disc. On burnt ground,
+        only this prior keeps the gradient from explaining whatever makes opposite edges differ.
+
+        The prior of white holds for burnt discs only. Otherwise white is seen, and the prior, added
+        by each of many discs, would bend the curve that they share.
         """
         sd = min(_FALL * radius_px / (0.5 * frame_px), _PRIOR_SD[Row.SLOPE_X])
         if self.is_light_curved:
@@ -211,13 +219,13 @@ class DiscUnknowns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscState:
-    """Numbers that the adjustment works with."""
+    """The parameters of a disc."""
 
     vector: FloatArray  # (21,): in the order of `Row`
 
     @classmethod
     def of(cls, geometry: Geometry, blur: Blur, levels: tuple[float, float]) -> DiscState:
-        """Collect the numbers; levels are the light of ink and plate."""
+        """Collect the parameters; levels are the light of ink and plate."""
         vector = np.zeros(COUNT)
         vector[:GEOMETRY_COUNT] = geometry
         mean, difference = 0.5 * (blur.xx + blur.yy), 0.5 * (blur.xx - blur.yy)
@@ -251,21 +259,21 @@ class DiscState:
         return black, white
 
     def share_at(self, level: float, tone: Tone) -> float:
-        """Return the white share at which a grey value is reached, 0…1; in even light."""
+        """Return the white share that has a grey value in even light, 0…1."""
         black, white = self.vector[[Row.BLACK, Row.WHITE]].tolist()
         light = float(self.tone(tone).light(np.array([level]))[0])
         share = (light - black) / max(white - black, 1e-9)
         return float(min(max(share, 0.0), 1.0))
 
     def moved(self, step: FloatArray, tone: Tone) -> DiscState:
-        """Return the state after a step (21,), such that ellipse, blur and tone can be.
+        """Return the state after a step (21,), with ellipse, blur and tone kept possible.
 
-        Where the tone curve changes, the levels follow such that their grey values change by as
-        much as the step promises: steps of both would go wrong together.
+        If the tone curve changes, the levels follow it, so that their grey values change by what
+        the step promises to first order. Independent steps of curve and levels would go wrong.
         """
         moved, before = self.vector + step, self.vector[Row.BLUR_MEAN]
         moved[:GEOMETRY_COUNT] = limited(moved[:GEOMETRY_COUNT])
-        if step[Row.BLUR_MEAN] < 0.0:  # what steps promise of narrower blur is too much
+        if step[Row.BLUR_MEAN] < 0.0:  # steps towards a narrower blur go too far
             moved[Row.BLUR_MEAN] = before**2 / (before - step[Row.BLUR_MEAN])
         moved[Row.BLUR_MEAN] = max(moved[Row.BLUR_MEAN], _MIN_VARIANCE_PX2)
         moved[Row.WAVE_1 : Row.SHARPENING] = plausible(moved[Row.WAVE_1 : Row.SHARPENING], tone)
@@ -274,8 +282,8 @@ class DiscState:
         if tone.is_shaped:
             levels = [Row.BLACK, Row.WHITE]
             grey = self.tone(tone).levels(self.vector[levels])
-            nearby = self.vector + _LITTLE * step
-            grey += (DiscState(nearby).tone(tone).levels(nearby[levels]) - grey) / _LITTLE
+            nearby = self.vector + _SMALL_SHARE * step
+            grey += (DiscState(nearby).tone(tone).levels(nearby[levels]) - grey) / _SMALL_SHARE
             moved[levels] = DiscState(moved).tone(tone).light(grey)
         elongation = math.hypot(moved[Row.BLUR_DIFFERENCE], moved[Row.BLUR_XY])
         excess = elongation / (_MAX_ANISOTROPY * moved[Row.BLUR_MEAN])
@@ -287,16 +295,16 @@ class DiscState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscSample:
-    """The pixels of one round."""
+    """The pixels that are used in one round."""
 
     pixels: DiscPixels
     levels: FloatArray  # (n,)
     censoring: Censoring
     level_model: LevelModel
-    window: DiscWindow  # that they are from
-    index: IndexArray  # (n,): where in it
-    radius_px: float  # that gradients of the light refer to
-    is_noise_of_light: bool  # or of grey values: whether it grows evenly before the tone curve
+    window: DiscWindow  # that they are taken from
+    index: IndexArray  # (n,): flat indices in the window
+    radius_px: float  # unit of length of the light's gradients
+    is_noise_of_light: bool  # whether the noise is linear in the light, not in the grey value
 
     @classmethod
     def of(
@@ -343,11 +351,11 @@ class DiscSample:
         return self.censoring.share > MUCH_CLIPPED
 
     def unknowns(self, free: DiscUnknowns) -> DiscUnknowns:
-        """Return the unknowns of this disc, for those of any."""
+        """Return the unknowns of any disc with the priors of this one."""
         return free.in_light(self.radius_px, self.window.frame_px, is_burnt=self.is_burnt)
 
     def by(self, tone: Tone, sharpening_px: float, state: DiscState) -> DiscSample:
-        """Return the same pixels for another tone curve and another mask of the camera's."""
+        """Return the same pixels for another tone curve and another unsharp mask."""
         mask = None
         if sharpening_px:
             mask = _mask(self.window, self.index, state, sharpening_px, self.pixels)
@@ -361,7 +369,7 @@ def _mask(
     sharpening_px: float,
     pixels: DiscPixels,
 ) -> Mask:
-    """Return the mask of the camera's sharpening about the disc of some pixels."""
+    """Return the unsharp mask for the pixels of a disc."""
     whole = DiscPixels.of(
         window.places_px(np.arange(len(window.levels))),
         state.geometry,
@@ -398,7 +406,7 @@ class DiscFit:
 
     @property
     def curvature_gain(self) -> float:
-        """What uneven light would explain: χ² with three to five degrees of freedom."""
+        """χ² that curved light would explain, with three to five degrees of freedom."""
         is_new = ~np.isin(_UNEVEN, self.free.rows)
         terms = scaled_rows(self.jacobian, _UNEVEN[is_new], self.sd)
         weighted = terms * self.misfit.weight
@@ -410,13 +418,13 @@ class DiscFit:
 
     @property
     def light_curvature(self) -> FloatArray:
-        """Second derivatives (2, 2) of the light, relative to it [1/px²]; zeros: it is linear."""
+        """Relative second derivatives (2, 2) of the light [1/px²]; zeros: it is linear."""
         xx, xy, yy = (self.state.vector[CURVES] / self.sample.radius_px**2).tolist()
         return np.array(((2.0 * xx, xy), (xy, 2.0 * yy)))
 
     @property
     def leverage(self) -> FloatArray:
-        """Elements (n,) of the hat matrix's diagonal: how much of its own residual a pixel takes.
+        """Diagonal (n,) of the hat matrix: share of its own error that the fit takes from a pixel.
 
         Raises
         ------
@@ -432,15 +440,15 @@ class DiscFit:
 
     @property
     def redundancy(self) -> float:
-        """Pixels that are not clipped, beyond those that unknowns take: degrees of freedom."""
+        """Degrees of freedom: pixels that are not clipped, less those that the unknowns take up."""
         return float(np.sum(1.0 - self.leverage[~self.sample.censoring.is_clipped]))
 
     @property
     def noise_freedom(self) -> float:
-        """Degrees of freedom from which the noise of the edge's pixels was estimated.
+        """Degrees of freedom of the estimated noise of the edge's pixels.
 
-        Both plateaus tell it, unless one is clipped: then the edge itself does, if it has enough
-        pixels.
+        Noise is estimated from both plateaus. If one of them is clipped, it is estimated from the
+        edge itself, provided that this has enough pixels.
         """
         seen = ~self.sample.censoring.is_clipped
         is_edge = seen & (self.share > 0.2) & (self.share < 0.8)
@@ -450,16 +458,16 @@ class DiscFit:
 
     @property
     def noise(self) -> GreyNoise:
-        """The noise that the residuals show, allowing for what the fit has taken from them.
+        """The noise that the residuals show, corrected for what the fit has taken from them.
 
-        A pixel of leverage h leaves 1 − h of its variance in its residual.
+        The residual of a pixel with leverage h has 1 − h of the variance of its noise.
         """
         residual_share = np.maximum(1.0 - self.leverage, _LEAST_RESIDUAL_SHARE)
         return _noise(self.sample, self.share, self.levels, residual_share)
 
 
 def fit_disc(sample: DiscSample, start: DiscState, free: DiscUnknowns) -> DiscFit:
-    """Minimise the negative log-likelihood, until the noise is the one that residuals show.
+    """Minimise and estimate the noise from the residuals in turn, until the noise is settled.
 
     Raises
     ------
@@ -467,11 +475,11 @@ def fit_disc(sample: DiscSample, start: DiscState, free: DiscUnknowns) -> DiscFi
         If there are fewer pixels than unknowns, or the equations cannot be solved.
     """
     state, free = start, sample.unknowns(free)
-    if len(sample.levels) < len(free.rows):  # all others belong to something else
+    if len(sample.levels) < len(free.rows):  # other edges reach all other pixels
         raise NoFit
     linear = _linearised(sample, state)
     sd = _noise(sample, linear.share, linear.levels).sd
-    seen = ~sample.censoring.is_clipped  # most of a burnt disc is not
+    seen = ~sample.censoring.is_clipped
     for _ in range(_NOISE_ROUNDS):
         fit = _minimise(sample, state, free, sd, linear)
         state, linear = fit.state, _Linear(fit.share, fit.levels, fit.jacobian)
@@ -497,7 +505,7 @@ def disc_fit_at(
     sd: FloatArray,
     linear: _Linear | None = None,
 ) -> DiscFit:
-    """Linearise at a state, unless that is done, with noise (n,) that is known."""
+    """Return a fit linearised at a state, with given noise (n,); `linear`: if that is known."""
     share, levels, jacobian = linear or _linearised(sample, state)
     current = misfit(sample.levels, levels, sd, sample.censoring)
     scaled = scaled_rows(jacobian, free.rows, sd)
@@ -507,12 +515,12 @@ def disc_fit_at(
 
 
 def misfit_by(fit: DiscFit, sd: FloatArray) -> float:
-    """Return the negative log-likelihood of a fit's pixels, up to a constant, by noise (n,)."""
+    """Return the negative log-likelihood of a fit's pixels with given noise, up to a constant."""
     return misfit(fit.sample.levels, fit.levels, sd, fit.sample.censoring).total
 
 
 def noise_at(sample: DiscSample, state: DiscState) -> GreyNoise:
-    """Return the noise that the residuals of any state show, fitted or not."""
+    """Return the noise that the residuals of a state show, which need not be fitted."""
     linear = _linearised(sample, state)
     return _noise(sample, linear.share, linear.levels)
 
@@ -530,14 +538,17 @@ def _noise(
 ) -> GreyNoise:
     """Return the noise of every pixel, from those that are not clipped.
 
-    Just below a clipping limit, only pixels with negative noise are seen. Taken for all, they made
-    the noise at the edges of burnt discs of R 3 px 28 % too small. So pixels are chosen by their
-    modelled level, a margin away from the limits; the margin needs a first estimate of the noise. A
-    model that is far off may put all of them beyond: then those that are not clipped have to do.
-    `residual_share` is the share of a pixel's variance that is left in its residual.
+    Just below a clipping limit, only pixels with negative noise are seen unclipped. When they were
+    used, the noise at the edges of burnt discs of R 3 px came out 28 % too small. So pixels are
+    chosen by their modelled level, a margin away from the limits. The margin needs a first estimate
+    of the noise. If a model that is far off puts too many pixels beyond it, all pixels that are not
+    clipped are used.
 
-    Before sRGB's curve, if that is the camera's: noise grows with the light there. After it, ink is
-    noisier than paper, which `estimate_noise` takes for impossible where ink is hardly seen.
+    If the camera's curve is stated to be sRGB's, the noise is estimated before the curve, where it
+    grows with the light. After the curve, ink is noisier than paper, which `estimate_noise` rules
+    out where ink is hardly seen.
+
+    `residual_share` is the share of a pixel's variance that is left in its residual.
     """
     limits, is_seen = sample.censoring, ~sample.censoring.is_clipped
     residuals = (sample.levels - levels) / np.sqrt(residual_share)
@@ -566,12 +577,12 @@ def _noise(
 def _minimise(
     sample: DiscSample, state: DiscState, free: DiscUnknowns, sd: FloatArray, linear: _Linear
 ) -> DiscFit:
-    """Take damped Gauss-Newton steps (Levenberg-Marquardt) from a state that is linearised."""
+    """Take damped Gauss-Newton steps (Levenberg-Marquardt) from a linearised state."""
     fit, damping = disc_fit_at(sample, state, free, sd, linear), _DAMPING
     total = fit.misfit.total + free.penalty(fit.state.vector)
     for _ in range(_STEPS):
         step, promised = _step(fit, damping)
-        if promised < _ENOUGH:
+        if promised < _LEAST_PROMISE:
             break
         trial = disc_fit_at(sample, fit.state.moved(step, free.tone), free, sd)
         trial_total = trial.misfit.total + free.penalty(trial.state.vector)

@@ -1,8 +1,8 @@
-"""The texture of ground as a random field: grass, gravel, worn asphalt.
+"""The texture of ground (grass, gravel, worn asphalt) as a random field.
 
-Its light is correlated in neighbouring pixels: over a distance d by Matérn's function for ν = 3/2,
-(1 + d/ℓ) exp(−d/ℓ) (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, eq.
-4.17). Standard deviation and ℓ follow from the ground itself, by restricted likelihood (Patterson
+The light of pixels at a distance d has the correlation (1 + d/ℓ) exp(−d/ℓ), Matérn's function for
+ν = 3/2 (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, eq. 4.17). Its
+standard deviation and ℓ are estimated from the ground itself, by restricted likelihood (Patterson
 and Thompson, Biometrika 58, 1971).
 """
 
@@ -17,8 +17,8 @@ import numpy as np
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 
 _LENGTHS_PX = (0.8, 1.2, 1.8, 2.7, 4.0, 6.0, 9.0)
-_VARIANCES = np.geomspace(0.01, 4.0, 25)  # of that of the residuals
-_USUAL_LENGTH_PX, _SD_LOG_LENGTH = 1.5, 1.0  # in photographs of ground
+_VARIANCES = np.geomspace(0.01, 4.0, 25)  # tried, relative to the variance of the residuals
+_USUAL_LENGTH_PX, _SD_LOG_LENGTH = 1.5, 1.0  # prior of ℓ, from photographs of ground
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,13 +51,13 @@ def _correlation(distances_px: FloatArray, length_px: float) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sector:
-    """Pixels that are beside each other."""
+    """Neighbouring pixels."""
 
-    index: IndexArray  # (n,): of the pixels
+    index: IndexArray  # (n,): numbers of the pixels
     places_px: FloatArray  # (2, n)
 
     def only(self, chosen: BoolArray) -> Sector:
-        """Return the sector with those of its pixels that are chosen, of all there are."""
+        """Return the sector without the pixels that are not `chosen` (a mask of all pixels)."""
         kept = chosen[self.index]
         return Sector(self.index[kept], self.places_px[:, kept])
 
@@ -70,7 +70,7 @@ class Sector:
 def sectors_about(centre_px: FloatArray, places_px: FloatArray, most_pixels: int) -> list[Sector]:
     """Divide pixels (2, n) by their direction from a centre (2,), into sectors of so many at most.
 
-    They are taken as if the texture of one said nothing of the next.
+    Sectors are treated as independent: the correlation of texture across their borders is left out.
     """
     x, y = places_px - centre_px[:, None]
     order = np.argsort(np.arctan2(y, x), kind="stable")
@@ -89,7 +89,7 @@ class _Modes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TextureModes:
-    """Modes of the ground in some sectors, for each of `_LENGTHS_PX`.
+    """Eigenmodes of the ground's correlation in some sectors, for each of `_LENGTHS_PX`.
 
     With them, the likelihood of a variance is a sum over modes.
     """
@@ -109,13 +109,16 @@ class TextureModes:
         return cls(tuple(by_length))
 
     def likeliest(self, columns: FloatArray, residuals: FloatArray, noise: float) -> GroundTexture:
-        """Return the length of the greatest restricted likelihood, and the mean variance at it.
+        """Return the texture whose ℓ has the greatest restricted likelihood.
+
+        Its variance is the mean over the likelihood at that ℓ.
 
         Parameters
         ----------
         columns : (n, k) array
-            Derivatives of the grey values of all pixels with respect to what is adjusted, too; the
-            first is the light of the ground. Pixels of the ground are taken to see nothing else.
+            Derivatives of the grey values of all pixels with respect to other unknowns that the
+            ground tells; the first is the light of the ground. Pixels of the ground are taken to
+            depend on nothing else.
         residuals : (n,) array
         noise : float
             Standard deviation of the pixels' own noise.
@@ -139,9 +142,9 @@ class TextureModes:
 def _misfits(
     parts: Sequence[_Modes], both: FloatArray, variances: FloatArray, noise: float
 ) -> FloatArray:
-    """Return the negative logarithms of the restricted likelihoods of variances (v,).
+    """Return the negative logarithms (v,) of the restricted likelihoods of some variances.
 
-    `both` (n, k + 1) has the derivatives, and the residuals last.
+    `both` (n, k + 1) has the k derivatives, and the residuals as its last column.
     """
     log_det, width = np.zeros(len(variances)), both.shape[1]
     products = np.zeros((len(variances), width, width))

@@ -1,7 +1,7 @@
 """Discs adjusted as one problem: all share the camera's tone curve and its sharpening.
 
-What is a disc's own, ellipse, blur and light, is eliminated disc by disc (Schur), so that a step
-costs no more than one of every disc.
+The unknowns of each disc alone (ellipse, blur and light) are eliminated disc by disc with the Schur
+complement, so that a step costs no more than one step of every disc.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ from kgcp.measurement.image_model.noise import Misfit, misfit
 from kgcp.measurement.image_model.photometry import Tone
 
 _STEPS, _NOISE_ROUNDS = 25, 2
-# Noise before compression is estimated until it changes by less than this share in one round, and
-# nothing that is shared moves more. Discs of R 5 px by film's curve need 7 to 14 rounds.
+# Most rounds in which the noise before compression is estimated. They end when a round changes the
+# noise by less than the second, as a share, and the shared parameters by less than the third. Discs
+# of R 5 px with film's curve need 7 to 14 rounds.
 _COMPRESSION_ROUNDS, _SETTLED_NOISE, _SETTLED = 40, 0.05, 0.003
-_ENOUGH = 0.1  # of log-likelihood, promised by a step
+_LEAST_PROMISE = 0.1  # a step that promises a smaller gain in log-likelihood is not taken
 _DAMPING, _DAMPED, _MOST_DAMPING = 1e-6, 1e-3, 1e3
 _SHARED = np.array(CAMERA_ROWS)
 
@@ -49,11 +50,11 @@ class JointFit:
     tone: Tone
     sharpening_px: float  # σ of the camera's unsharp mask
     fits: tuple[DiscFit, ...]
-    loss: float  # negative log-likelihood, with what is usual of cameras, by noise that is given
-    precision: FloatArray  # (4, 4): of what they share, in the order of `CAMERA_ROWS`
-    scores: FloatArray  # (k, 4): of each disc, by what is shared; they add up to the prior's
-    informations: FloatArray  # (k, 4, 4): their expected covariances
-    is_settled: bool = True  # whether noise and curve stopped changing before the rounds ended
+    loss: float  # negative log-likelihood with the prior of usual cameras, for a given noise
+    precision: FloatArray  # (4, 4): of the shared parameters, in the order of `CAMERA_ROWS`
+    scores: FloatArray  # (k, 4): of each disc, by the shared ones; their sum balances the prior's
+    informations: FloatArray  # (k, 4, 4): expected covariances of these scores
+    is_settled: bool = True  # whether noise and curve settled before the rounds were used up
 
     @property
     def shared(self) -> FloatArray:
@@ -63,12 +64,12 @@ class JointFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Reduced:
-    """Normal equations of what k discs share, with all else eliminated."""
+    """Normal equations of the c parameters that k discs share, with all others eliminated."""
 
     is_shared: BoolArray  # (p,)
     normals: FloatArray  # (k, c, c)
     gradients: FloatArray  # (k, c)
-    # of what is each disc's own, p - c = r unknowns
+    # of the r = p − c unknowns of each disc alone
     inverse_others: FloatArray  # (k, r, r)
     between: FloatArray  # (k, c, r)
     own_gradients: FloatArray  # (k, r)
@@ -81,14 +82,14 @@ def adjust_together(
     sharpening_px: float,
     sds: Sequence[FloatArray],
 ) -> JointFit:
-    """Adjust discs with what they share, from states that share it.
+    """Adjust discs together, from states with the same shared parameters.
 
     Parameters
     ----------
     sds : sequence of (n,) arrays
-        Noise of each disc's pixels as level, by which the loss is stated: the same for all curves
-        that are compared. The noise that their own residuals show differs by chance, and would make
-        curves likelier by up to 40 for forty discs.
+        Noise of each disc's pixels as level, with which the loss is computed. It must be the same
+        for all curves that are compared. With the noise of their own residuals, which differs by
+        chance, curves would become likelier by up to 40 for forty discs.
 
     Raises
     ------
@@ -113,7 +114,7 @@ def adjust_before_compression(
     steps: Sequence[FloatArray | None],
     sds: Sequence[FloatArray] | None = None,
 ) -> JointFit:
-    """Adjust discs of compressed photographs to what is left of their coefficients.
+    """Adjust discs of compressed photographs to the intervals of their rounded coefficients.
 
     Parameters
     ----------
@@ -123,7 +124,7 @@ def adjust_before_compression(
         Of each disc's photograph, by `quantisation_steps`; None: it was not compressed.
     sds : sequence of (n,) arrays, optional
         Noise of each disc's pixels before compression; by default, it is estimated in rounds. Only
-        losses by the same noise can be compared.
+        losses with the same noise can be compared.
 
     Raises
     ------
@@ -175,10 +176,10 @@ def compressed_fit_at(
     sd: FloatArray,
     pixels: CompressedPixels | None,
 ) -> DiscFit:
-    """Linearise at a state, with noise (n,) from before the photograph was compressed.
+    """Return a fit linearised at a state, with the noise (n,) before compression.
 
-    Misfit and scaled Jacobian are those of the coefficients, then of pixels that tell for
-    themselves.
+    Misfit and scaled Jacobian are those of the coefficients, followed by those of pixels that are
+    not in a used block.
     """
     fit = disc_fit_at(sample, state, free, sd)
     if pixels is None:
@@ -201,20 +202,20 @@ def compressed_fit_at(
 
 
 def noise_before_compression(fit: DiscFit, pixels: CompressedPixels | None) -> FloatArray:
-    """Return the noise (n,) as level that pixels of a fit have had before compression.
+    """Return the noise (n,) as level that the pixels of a fit had before compression.
 
-    It is that of the values to be expected, and what they may be off (Dempster, Laird & Rubin,
-    "Maximum likelihood from incomplete data via the EM algorithm", 1977).
+    It is the noise of the expected values before compression, plus their variance (Dempster, Laird
+    & Rubin, "Maximum likelihood from incomplete data via the EM algorithm", 1977).
     """
     if pixels is None:
         return noise_at(fit.sample, fit.state).sd
     levels, variance = pixels.levels_before(fit.sample.levels, fit.levels, fit.sd)
-    left = noise_at(replace(fit.sample, levels=levels), fit.state).sd
-    return np.asarray(np.sqrt(left**2 + variance))
+    sd = noise_at(replace(fit.sample, levels=levels), fit.state).sd
+    return np.asarray(np.sqrt(sd**2 + variance))
 
 
 def _unknowns(tone: Tone, sharpening_px: float) -> DiscUnknowns:
-    """Return the unknowns of a disc without what is usual of cameras: all say that once."""
+    """Return the unknowns of a disc without the prior of usual cameras: it counts once for all."""
     usual = ProcessingPrior.usual()
     nothing = replace(usual, precision=np.zeros_like(usual.precision))
     return DiscUnknowns.of(tone, nothing, sharpening_px=sharpening_px)
@@ -247,13 +248,13 @@ def _minimised(
 ) -> list[DiscFit]:
     """Take damped Gauss-Newton steps of all discs together.
 
-    After each, every disc takes a step of its own with what is shared held fast: tone curve, blur
-    and levels make a narrow, bent valley, and a step of all parameters at once ends on its slope.
+    After each, every disc takes a step of its own, with the shared parameters fixed. Tone curve,
+    blur and levels form a narrow, bent valley, and a step of all parameters ends on its slope.
 
     Parameters
     ----------
     pixels : sequence of CompressedPixels, optional
-        What compression left of each disc's; None: there was none.
+        Compressed pixels of each disc; None: it was not compressed.
     """
     pixels = [None] * len(samples) if pixels is None else pixels
     frees = [sample.unknowns(free) for sample in samples]
@@ -270,7 +271,7 @@ def _minimised(
     total = _total(fits, usual)
     for _ in range(_STEPS):
         steps, promised = _steps(fits, usual, damping)
-        if promised < _ENOUGH:
+        if promised < _LEAST_PROMISE:
             break
         trial = moved(fits, steps)
         settled = moved(trial, _own_steps(trial))
@@ -287,16 +288,16 @@ def _minimised(
 
 
 def _is_near(fit: DiscFit, start: DiscState) -> bool:
-    """Return whether a disc is still the one that the adjustment began with.
+    """Tell whether a disc is still near the place where the adjustment began.
 
-    One that ran away would leave its equations singular, and with them those of what all share.
+    A disc that ran away would make its equations singular, and with them the common ones.
     """
     moved_px = np.abs(fit.state.geometry - start.geometry).max()
     return bool(moved_px <= mean_radius_px(start.geometry))
 
 
 def _own_total(fit: DiscFit) -> float:
-    """Return the negative log-likelihood of a disc with the priors of what is its own."""
+    """Return the negative log-likelihood of a disc with the priors of its own unknowns."""
     return fit.misfit.total + fit.free.penalty(fit.state.vector)
 
 
@@ -311,7 +312,7 @@ def _penalty(shared: FloatArray, usual: ProcessingPrior) -> float:
 
 
 def _own_steps(fits: Sequence[DiscFit]) -> FloatArray:
-    """Return steps (k, 21) of what is each disc's own."""
+    """Return steps (k, 21) of the unknowns of each disc alone."""
     rows = fits[0].free.rows
     own = np.flatnonzero(~np.isin(rows, _SHARED))
     normals = np.array([fit.normal[np.ix_(own, own)] for fit in fits])
@@ -322,9 +323,9 @@ def _own_steps(fits: Sequence[DiscFit]) -> FloatArray:
 
 
 def _reduced(fits: Sequence[DiscFit], damping: float) -> _Reduced:
-    """Eliminate what is each disc's own. All have the same unknowns."""
+    """Eliminate the unknowns of each disc alone. All discs have the same unknowns."""
     is_shared = np.isin(fits[0].free.rows, _SHARED)
-    order = np.argsort(~is_shared, kind="stable")  # what is shared first
+    order = np.argsort(~is_shared, kind="stable")  # the shared ones first
     count = np.count_nonzero(is_shared)
     normals = np.array([fit.normal for fit in fits])
     diagonal = np.arange(len(order))
@@ -345,20 +346,20 @@ def _reduced(fits: Sequence[DiscFit], damping: float) -> _Reduced:
 
 
 def within_limits(step: FloatArray, normal: FloatArray, now: FloatArray, tone: Tone) -> FloatArray:
-    """Return the step (k,) of what is shared that gains most of all that keep the curve plausible.
+    """Return the step (k,) of the shared parameters that gains most and keeps the curve plausible.
 
-    Cut off afterwards, steps would end where they first meet a limit, wherever along it the best
-    curve is. It is the least distance from the free step in the metric of the normal equations
-    (Lawson & Hanson, "Solving least squares problems", 1974, chapter 23: LDP).
+    It has the least distance from the free step in the metric of the normal equations (Lawson &
+    Hanson, "Solving least squares problems", 1974, chapter 23: LDP). If free steps were merely cut
+    off, they would end where they first meet a limit, not at the best curve along it.
 
     Parameters
     ----------
     step : (k,) array
-        That gains most of all, in the order of `CAMERA_ROWS`; the waves come first.
+        Free step, in the order of `CAMERA_ROWS`; the waves come first.
     normal : (k, k) array
-        Of the normal equations that it solves.
+        Normal matrix of the equations that it solves.
     now : (k,) array
-        What the step starts from.
+        Shared parameters before the step.
     tone : Tone
         A bent curve.
 
@@ -373,7 +374,7 @@ def within_limits(step: FloatArray, normal: FloatArray, now: FloatArray, tone: T
     short = least - of_waves @ (now + step)[:WAVES]
     if short.max() <= 0.0:
         return step
-    from scipy.optimize import nnls  # 0.1 s that flights do not need
+    from scipy.optimize import nnls  # 0.1 s to import, which flights do not need
 
     root = np.linalg.cholesky(normal)
     rows = np.pad(of_waves, ((0, 0), (0, len(step) - WAVES)))

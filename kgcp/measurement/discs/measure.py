@@ -1,4 +1,4 @@
-"""Discs measured from their grey values: (x, y, S_xx, S_xy, S_yy) with its covariance."""
+"""Discs measured from their grey values: centroid and second moments, with their covariance."""
 
 from __future__ import annotations
 
@@ -46,8 +46,9 @@ from kgcp.measurement.discs.records import (
 from kgcp.measurement.discs.ring_unknowns import RingUnknowns
 from kgcp.measurement.discs.textured_ground import fit_on_texture
 
-_LARGEST_SD_PX = 1.0  # of the centre, and of the moments over the radius
-_NEIGHBOUR_RADII, _NEIGHBOUR_PX = 4.0, 40.0  # beyond the nearer of these, no window reaches
+_LARGEST_SD_PX = 1.0  # of the centre, and of the moments divided by the radius
+# A disc's window reaches no farther beyond its outline than the smaller of these
+_NEIGHBOUR_RADII, _NEIGHBOUR_PX = 4.0, 40.0
 
 
 def measure_discs(
@@ -66,14 +67,15 @@ def measure_discs(
     grey : (height, width) array
         Grey values of 8 or 16 bits.
     outlines : sequence of DiscOutline
-        By `find_outlines` or `follow_outlines`. Each one's pixels are kept clear of the others.
+        By `find_outlines` or `follow_outlines`. Each disc's pixels are kept clear of the others.
     response : Response
         How grey values follow light.
     camera : CameraTone, optional
-        What the camera does to all discs, an unknown tone curve and sharpening, as `learn_camera`
-        says; by default, it is learned from the largest of these.
+        Tone curve, sharpening and focus of the camera, by `learn_camera`; by default, they are
+        learned from the largest of these discs.
     ground : float
-        How far the bare ground around a disc reaches from its middle, in radii: to a ring of code.
+        How far the bare ground around a disc reaches from its middle, in radii, if a ring of code
+        follows.
     """
     return _measured(_tasks(grey, outlines, ground), response, operator, camera)
 
@@ -84,7 +86,7 @@ def learn_camera(
     *,
     ground: float = math.inf,
 ) -> CameraTone:
-    """Learn what a camera does to all discs from several photographs with their outlines.
+    """Learn tone curve, sharpening and focus of a camera from photographs with their outlines.
 
     Parameters
     ----------
@@ -118,12 +120,11 @@ def measure_disc(
     neighbours : sequence of DiscOutline
         Other edges that may be near: their pixels are left out.
     inner : (k, 3) array
-        Of a ring that is measured as a whole: its circles within the outline, from the outside to
-        the inside, as centre and radius where the outline is the unit circle. They move and grow
-        with it.
+        Circles within the outline of a ring that is measured as a whole, from the outside to the
+        inside: centre and radius, where the outline is the unit circle. They move and grow with it.
     is_ground_even : bool
-        False: its ground has a texture, as grass and gravel have. Not of a ring as a whole, and not
-        by other operators.
+        False: its ground has a texture, as grass and gravel have. This has no effect on a ring that
+        is measured as a whole, or with another operator than the image model.
     """
     task = DiscTask(grey, outline, _others(outline, neighbours), inner, is_ground_even)
     return _measured([task], response, operator, None)[0]
@@ -144,13 +145,15 @@ def _measured(
 ) -> list[Disc | DiscMiss]:
     if operator is not Operator.MODEL:
         measure = measure_by_centroid if operator is Operator.CENTROID else measure_by_gaussian
-        return [_certain(measure(task)) for task in tasks]
+        return [_refuse_uncertain(measure(task)) for task in tasks]
     camera = learn_tone([tasks], response) if camera is None else camera
     outcomes = [_fitted(task, camera) for task in tasks]
     fits = [each for each in outcomes if not isinstance(each, DiscMiss)]
     found = iter(inflations([scatter for _, scatter in fits]).tolist())
     return [
-        each if isinstance(each, DiscMiss) else _certain(_disc(*each, task.outline, next(found)))
+        each
+        if isinstance(each, DiscMiss)
+        else _refuse_uncertain(_disc(*each, task.outline, next(found)))
         for task, each in zip(tasks, outcomes, strict=True)
     ]
 
@@ -172,7 +175,7 @@ def _fitted(task: DiscTask, camera: CameraTone) -> tuple[DiscFit, DiscScatter] |
 
 
 def _with_ring_unknowns(fit: DiscFit) -> tuple[DiscFit, DiscScatter]:
-    """Return a ring measured with its own level within, and its own width of the ink.
+    """Return a ring that was adjusted as a whole, corrected by its `RingUnknowns`.
 
     Raises
     ------
@@ -188,8 +191,8 @@ def _with_ring_unknowns(fit: DiscFit) -> tuple[DiscFit, DiscScatter]:
     return replace(fit, state=unknowns.corrected(fit.state)), replace(scatter, common=common)
 
 
-def _certain(outcome: Disc | DiscMiss) -> Disc | DiscMiss:
-    """Refuse a disc whose place or size is hardly known: clutter, or noise."""
+def _refuse_uncertain(outcome: Disc | DiscMiss) -> Disc | DiscMiss:
+    """Refuse a disc whose place or size is hardly determined: it is clutter, or noise."""
     if isinstance(outcome, DiscMiss):
         return outcome
     ellipse = outcome.outline.ellipse
@@ -206,7 +209,7 @@ def _certain(outcome: Disc | DiscMiss) -> Disc | DiscMiss:
 
 
 def _others(outline: DiscOutline, neighbours: Sequence[DiscOutline]) -> list[Geometry]:
-    """Return the edges whose pixels are left out, the outline's own hole among them."""
+    """Return the edges whose pixels are left out: the neighbours, and the outline's own hole."""
     others = [outline_geometry(each) for each in neighbours]
     if outline.hole is not None:
         others.append(geometry_of(moments_of_ellipse(outline.hole)))
@@ -214,10 +217,10 @@ def _others(outline: DiscOutline, neighbours: Sequence[DiscOutline]) -> list[Geo
 
 
 def _neighbours(outlines: Sequence[DiscOutline]) -> list[list[int]]:
-    """Return, for each outline, which others may be in its window.
+    """Return, for each outline, the numbers of the others that may be in its window.
 
-    Beside it, only those of its polarity: of a dark disc and a bright one side by side, one is what
-    is left of the ground between discs.
+    Outlines beside it count only if they have the same polarity. If they have the other one, they
+    are ground between discs that happens to look like a disc.
     """
     if not outlines:
         return []
@@ -245,8 +248,8 @@ def _disc(fit: DiscFit, scatter: DiscScatter, outline: DiscOutline, inflation: f
     moments = 0.25 * np.array((xx * xx + xy * xy, xy * (xx + yy), xy * xy + yy * yy))
     blur = fit.state.blur
     gradient = fit.state.slope / fit.sample.radius_px
-    # The light falls on the scene before it is blurred: a gradient g displaces the whole image of
-    # the disc by −B g, if B is the blur's covariance.
+    # The light falls on the scene, which is then blurred: with the blur's covariance B, a gradient
+    # g displaces the whole image of the disc by −B g.
     spread = np.array(((blur.xx, blur.xy), (blur.xy, blur.yy)))
     centre = np.array((x, y)) + spread @ gradient
     black, white = fit.state.plateaus(fit.free.tone)

@@ -29,21 +29,26 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 # Tuning, as in `blobs`.
-_REACHES = (0.45, 0.25, 0.2)  # of the radius that edges are looked for in, pass by pass, …
-_LEAST_REACHES_PX = (2.0, 1.5, 1.5)  # … or so many pixels
+# How far from the ellipse edges are looked for, pass by pass: in radii, and at least and at most in
+# pixels
+_REACHES = (0.45, 0.25, 0.2)
+_LEAST_REACHES_PX = (2.0, 1.5, 1.5)
 _MOST_REACH_PX = 12.0
-_LIMIT_PX, _LIMIT = 0.5, 0.04  # distance of an edge point that counts: pixels, and of the radius
-_LEAST_INLIERS = 0.8
-_RESIDUAL_PX, _RESIDUAL = 0.3, 0.012  # largest root mean square: pixels, and of the radius
+_LIMIT_PX, _LIMIT = 0.5, 0.04  # largest distance of an edge that counts: in pixels, and in radii
+_LEAST_INLIERS = 0.8  # share of the rays whose edge counts
+_RESIDUAL_PX, _RESIDUAL = 0.3, 0.012  # largest RMS distance: in pixels, and in radii
 _LEAST_SEMI_AXIS_PX = 1.2
 _MOST_ASPECT = 4.0
 _LEAST_CONTRAST = 0.03  # of what is white in the photograph
-_NEAR, _ALIKE = 0.3, 1.25  # centres, of the radius, and ratio of radii of one and the same edge
+# Two outlines are of the same edge if their centres are nearer than this (in radii) and the ratio
+# of their radii is smaller than this.
+_NEAR, _ALIKE = 0.3, 1.25
 _CONCENTRIC = 0.2  # of the larger radius: how far the centre of a hole may be off
 _LARGEST_HOLE = 0.95  # of the radius
-# Sharpening leaves a faint edge on either side of an edge: by masks of 1.1 px and 0.6 to 1.5 times
-# the detail, 2.4 to 3.7 px off and of 0.04 to 0.13 of its contrast. Of rings, one so narrow whose
-# sides differ so much looks the same, and loses its fainter edge.
+# Sharpening leaves a faint edge on either side of an edge. With masks of σ = 1.1 px and strengths
+# of 0.6 to 1.5, it is 2.4 to 3.7 px off and has 0.04 to 0.13 of the contrast. An outline that is
+# nearer and fainter than the following limits is left out. A ring that is as narrow and has sides
+# that differ as much looks the same, and loses its fainter edge.
 _RIPPLE_PX, _RIPPLE = 4.0, 0.15
 
 
@@ -52,9 +57,9 @@ class _Edges:
     """Ellipses through edge points, for n candidates."""
 
     ellipses: FloatArray  # (n, 5): centre and symmetric stretch
-    shares: FloatArray  # (n,): of the rays whose edge is on the ellipse
-    residual_px: FloatArray  # (n,)
-    contrast: FloatArray  # (n,): of the grey values' range
+    shares: FloatArray  # (n,): share of the rays whose edge is on the ellipse
+    residual_px: FloatArray  # (n,): RMS distance of these edges
+    contrast: FloatArray  # (n,): as a share of the grey values' range
 
 
 def find_outlines(grey: GreyArray) -> tuple[DiscOutline, ...]:
@@ -77,7 +82,7 @@ def find_outlines(grey: GreyArray) -> tuple[DiscOutline, ...]:
 def follow_outlines(
     grey: GreyArray, guesses: Sequence[DiscOutline], reach_px: float = 3.0
 ) -> tuple[DiscOutline | None, ...]:
-    """Look for edges where they must be; None where there is none.
+    """Look for edges near predicted ones; None where there is none.
 
     Parameters
     ----------
@@ -91,7 +96,7 @@ def follow_outlines(
         return ()
     ellipses = np.array([_stretched(each.ellipse) for each in guesses])
     signs = np.array([_sign(each.polarity) for each in guesses])
-    # a guess may be off by its whole reach, wherever the edge is then nearer to the middle
+    # in the first pass a guess may be off by its whole reach, even if that is much of its radius
     reaches_px = [np.full(len(guesses), reach_px), None, None]
     found = _edges_of(grey, ellipses, signs, reaches_px)
     is_disc = _is_disc(found)
@@ -109,7 +114,7 @@ def follow_outlines(
 def _follow(
     grey: GreyArray, ellipses: FloatArray, polarities: Sequence[Polarity]
 ) -> list[DiscOutline]:
-    """Return outlines of candidates that are ellipses, the best of those that are the same."""
+    """Return outlines of the candidates that are ellipses, only the best one of every edge."""
     if not len(ellipses):
         return []
     signs = np.array([_sign(each) for each in polarities])
@@ -146,7 +151,7 @@ def _edges_of(
 ) -> _Edges:
     """Fit ellipses to edges, in passes; each starts from the last and looks less far.
 
-    How far [px], is given for each pass, or goes with the radius.
+    `reaches_px` says how far, for each pass; None: in proportion to the radius.
     """
     image = np.ascontiguousarray(grey)
     count = len(ellipses)
@@ -158,7 +163,7 @@ def _edges_of(
         reach_px = np.clip(reach * radius, least, _MOST_REACH_PX) if given_px is None else given_px
         sample_edges(image, ellipses, signs, reach_px, edges, strengths, levels)
         inlying = strengths > 0.25 * np.median(strengths, axis=1, keepdims=True)
-        # first around the ellipse itself, then twice around what was fitted
+        # first with all strong edges, then twice with those near the fitted ellipse
         fit_ellipses(edges, inlying, DIRECTIONS, 2.0, fitted, shares)
         for limit in (2.0, 1.0):
             limits_px = limit * np.hypot(_LIMIT_PX, _LIMIT * radius)
@@ -175,14 +180,14 @@ def _edges_of(
 
 
 def _contrast(levels: FloatArray, inlying: BoolArray) -> FloatArray:
-    """Return the median difference (n,) of the levels (n, 2, rays) beside edges that count."""
+    """Return the median difference (n,) of the levels (n, 2, rays) beside inlying edges."""
     steps = np.where(inlying, np.abs(levels[:, 1] - levels[:, 0]), np.nan)
     steps[~inlying.any(axis=1)] = 0.0
     return np.asarray(np.nanmedian(steps, axis=1))
 
 
 def _carried(frames: FloatArray, fitted: FloatArray) -> FloatArray:
-    """Return ellipses (n, 5) fitted in the frames of others as centre and symmetric stretch."""
+    """Return ellipses as centre and symmetric stretch (n, 5), fitted in the frames of others."""
     x, y, a, b, angle = fitted.T
     stretch = _matrices(frames)
     c, s = np.cos(angle), np.sin(angle)
@@ -221,13 +226,13 @@ def _ellipse(values: FloatArray) -> Ellipse:
 
 def tree_of(points: FloatArray) -> cKDTree:
     """Return a search tree of points (n, 2)."""
-    from scipy.spatial import cKDTree  # 0.2 s that flights without plain targets do not need
+    from scipy.spatial import cKDTree  # 0.2 s to import, not needed without plain targets
 
     return cKDTree(points)
 
 
 def _distinct(found: _Edges, signs: FloatArray, candidates: IndexArray) -> list[int]:
-    """Return the candidates, the best of those that follow the same edge, in reading order."""
+    """Return the best candidate of every edge, in reading order."""
     best = sorted(candidates.tolist(), key=lambda i: (found.residual_px[i], i))
     if not best:
         return []
@@ -249,7 +254,7 @@ def _distinct(found: _Edges, signs: FloatArray, candidates: IndexArray) -> list[
 
 
 def _without_ripples(outlines: list[DiscOutline]) -> list[DiscOutline]:
-    """Leave out what sharpening makes of the edges of others: they would hide the disc inside."""
+    """Leave out the faint edges that sharpening makes: they would hide the disc inside."""
     if not outlines:
         return []
     centres = np.array([each.ellipse.centre for each in outlines])

@@ -1,4 +1,4 @@
-"""What is measured of a field of discs in one photograph."""
+"""A field of discs in one photograph: found, named and measured."""
 
 from __future__ import annotations
 
@@ -28,10 +28,11 @@ from kgcp.targets.fields.point_naming import name_by_codes, name_by_places
 from kgcp.targets.fields.points import AnyField
 
 _LEAST_DISCS = 6
-# Where a disc is looked at, in radii, and in how many directions.
-_MIDDLE, _INK, _GROUND, _AROUND = 0.1, 0.72, 1.6, 16
-_LIKE_GROUND = 0.4  # of the contrast
-_LEAST_WIDTH = 0.01  # of their length, of discs that are not in one row
+# To see a small hole, a disc is sampled on circles of these radii (in its own), in so many
+# directions
+_MIDDLE, _INK, _GROUND, _DIRECTIONS = 0.1, 0.72, 1.6, 16
+_LIKE_GROUND = 0.4  # of the contrast: a middle that differs from the ink by more is a hole
+_LEAST_WIDTH = 0.01  # of their length: discs that spread less across it are in one row
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,23 +42,23 @@ class PhotoDiscs:
     photo: str
     width: int
     height: int
-    lens: str  # camera and focal length by EXIF; empty: it does not say
-    outlines: int  # of the field's polarity, whether they have a name or not
-    is_symmetric: bool  # whether the field could lie there turned, too
-    point: FloatArray  # (k,): index of the field's disc
+    lens: str  # camera and focal length by EXIF; empty: not known
+    outlines: int  # number of outlines of the field's polarity, named or not
+    is_symmetric: bool  # whether the naming would fit a rotated field, too
+    point: FloatArray  # (k,): index of the disc in the field
     vectors: FloatArray  # (k, 5): as `kgcp.measurement.discs.records.MOMENTS`
     covs: FloatArray  # (k, 5, 5)
     # (k, 5): levels inside and outside, blur [px], share of clipped pixels, inflation
     appearance: FloatArray
-    is_guided: FloatArray  # (k,): 1 where it was found in the second pass
+    is_guided: FloatArray  # (k,): 1 if it was found in the second pass only
 
 
 @dataclass(frozen=True, slots=True)
 class PhotoMiss:
-    """A photograph of which nothing is used, and why."""
+    """A photograph that is not used, and why."""
 
     photo: str
-    width: int  # 0 where it could not be read
+    width: int  # 0 if the photograph could not be read
     height: int
     reason: str
     detail: str
@@ -70,11 +71,11 @@ class PhotoTask:
     field: AnyField
     response: Response
     operator: Operator
-    camera: CameraTone | None = None  # what all photographs share; None: each says it for itself
+    camera: CameraTone | None = None  # learned from all photographs; None: from each by itself
 
 
 def learn_from_fields(greys: Iterable[GreyArray], task: PhotoTask) -> CameraTone | None:
-    """Learn what a camera does to all discs from some photographs; None if that tells nothing."""
+    """Learn tone curve, sharpening and focus from some photographs; None if nothing is learned."""
     if task.operator is not Operator.MODEL or task.response is Response.LINEAR:
         return None
     photographs = []
@@ -102,7 +103,7 @@ def measure_field(
     if isinstance(naming, NamingProblem):
         detail = f"{len(own)} outlines like the field's discs"
         return PhotoMiss(photo, width, height, naming.value, detail)
-    # holes and others stay in the list as neighbours, whose pixels are left out
+    # holes and outlines of the other polarity stay as neighbours, whose pixels are left out
     measured = measure_discs(
         grey,
         outlines,
@@ -156,7 +157,7 @@ def _ground(field: AnyField) -> float:
 
 
 def _are_in_one_row(points_m: FloatArray) -> bool:
-    """Return whether points (k, 3) of a plane determine no homography: all but one in a row."""
+    """Tell whether points (k, 3) of a plane determine no homography: all but one are in a row."""
     for left_out in range(len(points_m)):
         rest = np.delete(points_m, left_out, axis=0)
         widths = np.linalg.svd(rest - rest.mean(axis=0), compute_uv=False)
@@ -168,16 +169,16 @@ def _are_in_one_row(points_m: FloatArray) -> bool:
 def measure_more(
     grey: GreyArray, task: PhotoTask, first: PhotoDiscs, predicted: FloatArray, point: IndexArray
 ) -> PhotoDiscs:
-    """Measure discs where they must be.
+    """Measure discs that the first pass has missed, where they must be.
 
     Parameters
     ----------
     first : PhotoDiscs
         What the first pass has measured.
     predicted : (k, 5) array
-        Centroids and moments of discs that it has not.
+        Centroids and moments of discs that it has missed.
     point : (k,) array
-        Which of the field's discs they are.
+        Their indices in the field.
     """
     polarity = Polarity(task.field.polarity.value)
     from_first = [_predicted(vector, polarity) for vector in first.vectors]
@@ -231,19 +232,20 @@ def _seen(grey: GreyArray, outlines: list[DiscOutline]) -> SeenDiscs:
     return SeenDiscs(
         np.array(centres, dtype=np.float64).reshape(-1, 2),
         np.array([outline.ellipse.stretch for outline in outlines]).reshape(-1, 2, 2),
-        has_hole | _has_other_middle(grey, outlines),
+        has_hole | _has_small_hole(grey, outlines),
     )
 
 
-def _has_other_middle(grey: GreyArray, outlines: list[DiscOutline]) -> BoolArray:
-    """Return which discs (n,) are in their middle like the ground: holes too small for an outline.
+def _has_small_hole(grey: GreyArray, outlines: list[DiscOutline]) -> BoolArray:
+    """Tell which discs (n,) are like the ground in their middle: holes too small for an outline.
 
-    In photographs of all sorts, middles of whole discs differ by up to a quarter of the contrast,
-    as sharpening and dirt make them; those of marks with 3 px radius by three quarters.
+    In photographs of all sorts, the middle of a whole disc differs from its ink by up to a quarter
+    of the contrast, because of sharpening and dirt. The middle of a hollow mark of 3 px radius
+    differs by three quarters.
     """
     if not outlines:
         return np.zeros(0, dtype=np.bool_)
-    angles = 2.0 * np.pi / _AROUND * np.arange(_AROUND)
+    angles = 2.0 * np.pi / _DIRECTIONS * np.arange(_DIRECTIONS)
     around = np.stack((np.cos(angles), np.sin(angles)), axis=1)
     stretches = np.array([outline.ellipse.stretch for outline in outlines])
     centres = np.array([outline.ellipse.centre for outline in outlines])

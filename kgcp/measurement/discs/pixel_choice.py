@@ -1,4 +1,4 @@
-"""Which pixels tell of a disc's edge: those around it, but none that another edge reaches."""
+"""The pixels that a disc is measured from: those around its edge that no other edge reaches."""
 
 from __future__ import annotations
 
@@ -14,19 +14,21 @@ from kgcp.geometry.grey_range import full_scale
 from kgcp.measurement.discs.affine_model import Geometry
 from kgcp.measurement.image_model.blur import Blur
 
-# Pixels beyond the reach of the blur, which tell the levels and how the light falls off. A ring of
-# 3 px leaves 5 % of the bound on discs of 5 px; a wider one meets more of what is not ground.
+# Width of the band beyond the reach of the blur that is used, too: it tells the levels and how the
+# light falls off. With 3 px, standard deviations of discs of 5 px are 5 % above the bound. A wider
+# band has more pixels that are not ground.
 _FLAT_PX = 3.0
 _REACH_SIGMAS = 3.5
-# Nearer to another edge than this, a pixel feels it: σ and pixels. On crowded boards so little
-# ground is left that some feeling (2 % of the contrast at most) costs less.
+# Pixels nearer to another edge than so many σ plus pixels are left out, as its blur reaches them.
+# On crowded boards little ground is left, and nearer pixels are used: the other edge changes them
+# by 2 % of the contrast at most, which costs less than to miss them.
 _CLEAR, _CROWDED = (2.8, 0.6), (2.0, 0.4)
-_EVERY_PX = 3  # of the disc's middle, every third pixel each way is enough for its level, …
-# … and of what else no blur reaches, of large discs every second or third: it is half of all pixels
-# and costs 5 or 6 % of the bound.
+_EVERY_PX = 3  # of the disc's middle, every third pixel each way is enough for its level
+# From these radii on, every second or third of the other pixels that no blur reaches is used. They
+# are half of all pixels; leaving them out costs 5 or 6 % of the bound.
 _SECOND_RADIUS_PX, _THIRD_RADIUS_PX = 25.0, 60.0
 _BLURRED_SIGMAS = 3.5
-_LEAST_GROUND = 0.3  # pixels beside the edge that must be left, per pixel of its length
+_LEAST_GROUND = 0.3  # pixels of ground that are needed, per pixel of the edge's length
 _MIN_GROUND = 10
 _MARGIN_PX = 4  # around the pixels, for the mask of a camera's sharpening
 
@@ -41,7 +43,7 @@ class DiscWindow:
     height: int
     levels: FloatArray  # (height · width,): 0…1 of the grey values' range
     levels_per_count: float
-    photo: GreyArray  # that it is cut out of
+    photo: GreyArray  # the whole photograph
 
     @property
     def frame_px(self) -> int:
@@ -55,7 +57,7 @@ class DiscWindow:
 
 
 def cut_disc_window(grey: GreyArray, geometry: Geometry, reach_px: float) -> DiscWindow:
-    """Cut out an ellipse with so much around it, as far as the photograph goes."""
+    """Cut out an ellipse with a margin around it, as far as the photograph goes."""
     x, y, xx, xy, yy = geometry.tolist()
     half_x, half_y = math.hypot(xx, xy) + reach_px, math.hypot(xy, yy) + reach_px
     x0, y0 = max(math.floor(x - half_x), 0), max(math.floor(y - half_y), 0)
@@ -63,7 +65,7 @@ def cut_disc_window(grey: GreyArray, geometry: Geometry, reach_px: float) -> Dis
     y1 = min(math.ceil(y + half_y) + 1, grey.shape[0])
     scale = full_scale(grey)
     levels = grey[y0:y1, x0:x1].astype(np.float64).ravel() / scale
-    # floats have no steps: as fine as 16 bits
+    # floats have no steps; they count as 16 bits
     count = 1.0 / scale if np.issubdtype(grey.dtype, np.integer) else 1.0 / 65535.0
     return DiscWindow(x0, y0, x1 - x0, y1 - y0, levels, count, grey)
 
@@ -93,7 +95,8 @@ def choose_pixels(
     neighbours : sequence of Geometry
         Other edges: beside this one, around it, or inside it.
     is_thinned : bool
-        Whether the middle of large discs is left out but for some of its pixels.
+        Whether only some of the pixels that no blur reaches are used, in the middle and of large
+        discs.
     """
     sd_px = blur.largest_sd_px
     others = np.array(neighbours, dtype=np.float64).reshape(-1, 5)
@@ -111,7 +114,7 @@ def choose_pixels(
 
 
 def _every(radius_px: float) -> int:
-    """Return which of the pixels that no blur reaches are used."""
+    """Return n, if every n-th of the pixels that no blur reaches is used."""
     return 1 + int(radius_px >= _SECOND_RADIUS_PX) + int(radius_px >= _THIRD_RADIUS_PX)
 
 
@@ -124,7 +127,7 @@ def _choose(
     every: tuple[int, int],
     chosen: BoolArray,
 ) -> int:
-    """Mark pixels; return how many of them are on the ground."""
+    """Mark the pixels to use; return how many are on the ground, left-out ones counted."""
     x0, y0, width, height = box
     reach_px, clear_px, sd_px = lengths_px
     is_around = np.zeros(len(others), np.bool_)
@@ -141,10 +144,10 @@ def _choose(
             off_px = _off(x, y, geometry)
             if off_px > reach_px:
                 continue
-            in_middle, beside = every
-            if off_px < -reach_px and (row % in_middle or column % in_middle):
+            every_in_middle, every_beside = every
+            if off_px < -reach_px and (row % every_in_middle or column % every_in_middle):
                 continue
-            if abs(off_px) > _BLURRED_SIGMAS * sd_px and (row + column) % beside:
+            if abs(off_px) > _BLURRED_SIGMAS * sd_px and (row + column) % every_beside:
                 continue
             is_free = True
             for k in range(len(others)):
@@ -152,13 +155,15 @@ def _choose(
                 is_free &= off_other < -clear_px if is_around[k] else off_other > clear_px
             if is_free:
                 chosen[row * width + column] = True
-                ground += (off_px > sd_px) * (beside if off_px > _BLURRED_SIGMAS * sd_px else 1)
+                ground += (off_px > sd_px) * (
+                    every_beside if off_px > _BLURRED_SIGMAS * sd_px else 1
+                )
     return ground
 
 
 @compiled
 def _off(px: float, py: float, geometry: FloatArray) -> float:
-    """Return the distance of a point outside an ellipse, negative inside; first order."""
+    """Return the distance of a point from an ellipse to first order, negative inside."""
     determinant = geometry[2] * geometry[4] - geometry[3] * geometry[3]
     a, b, d = geometry[4] / determinant, -geometry[3] / determinant, geometry[2] / determinant
     x, y = px - geometry[0], py - geometry[1]

@@ -1,8 +1,9 @@
 """Outlines of discs, measured discs, and discs that could not be measured.
 
-Sizes and directions are second moments of the disc's area, S = ∫ (p − c)(p − c)ᵀ dA / A: unlike
-axes and angles they are regular for a circle, too. An ellipse with semi-axes a, b has a²/4 and b²/4
-along them. `kgcp.geometry.circle_image` has the moments of a circle seen through a lens.
+Size and direction of a disc are the second moments of its area, S = ∫ (p − c)(p − c)ᵀ dA / A.
+Unlike axes and angles they are regular for a circle, too. An ellipse with semi-axes a and b has the
+moments a²/4 and b²/4 along them. `kgcp.geometry.circle_image` has the moments of a circle that is
+seen through a lens.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.conic import Ellipse
 
 MOMENTS = ("x", "y", "s_xx", "s_xy", "s_yy")
-"""What is measured of a disc, in the order of its covariance [px, px²]."""
+"""Names of the measured values of a disc, in the order of their covariance [px, px²]."""
 
 
 class Polarity(StrEnum):
@@ -46,7 +47,7 @@ class DiscReason(StrEnum):
     CUT = "cut"  # not wholly within the photograph
     CROWDED = "crowded"  # too little free ground around it, or too narrow a ring
     NO_CONTRAST = "no_contrast"  # disc and ground are of one grey
-    POOR_FIT = "poor_fit"  # the grey values are not those of a disc
+    POOR_FIT = "poor_fit"  # the grey values do not fit a disc
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,13 +59,13 @@ class DiscOutline:
     ellipse : Ellipse
         In raw pixels; good to about a tenth of a pixel.
     polarity : Polarity
-        That of what is directly inside the edge, against what is directly outside.
+        Of the area directly inside the edge, against that directly outside.
     contrast : float
         Difference of the levels on either side, as a share of what is white in the photograph.
     residual_px : float
         Root mean square of the edge points' distances from the ellipse [px].
     hole : Ellipse or None
-        Next concentric edge of the other polarity inside this one: the disc is a ring, or hollow.
+        Next concentric edge of the other polarity inside this one, if the disc is a ring or hollow.
     is_hole : bool
         Whether this edge is itself the hole of another outline in the same list.
     """
@@ -91,11 +92,11 @@ class Disc:
     Attributes
     ----------
     outline : DiscOutline
-        What it was measured from.
+        The outline that it was measured from.
     vector : (5,) array
         Centroid x, y [px] and second moments S_xx, S_xy, S_yy [px²], as `MOMENTS`.
     cov : (5, 5) array
-        Of `vector`, from the residuals as they are, with a floor for what no print is better than.
+        Of `vector`, from residuals that may be correlated, with a floor that no print is below.
     inside, outside : float
         Levels of the disc and of the ground at its centre, before clipping: 0…1 of the grey
         values' range.

@@ -1,13 +1,14 @@
-"""What the adjustment of a ring as a whole takes for known: the level within, and its ink's width.
+"""Two more unknowns of a ring that is adjusted as a whole: the level within, and the ink's width.
 
-Such a ring has two levels, ink and the same ground inside and outside, and its circles grow alike.
-If the inside is a little darker or brighter, that displaces the edges. And what a tone curve or
-burnt light leave of the edges' displacement widens the ink at all circles: the outer one grows, the
-next one shrinks. Of a disc nothing tells that from its size. Of a ring the other edges do.
+The adjustment of such a ring assumes two levels, ink and the same ground inside and outside, and
+circles that grow together. Two things break that. If the inside is darker or brighter than the
+outside, edges are displaced. And what the model of a tone curve or of burnt light lacks widens the
+ink at all circles: the outer one grows, the next one shrinks. On a disc nothing tells this widening
+from the size; on a ring the other edges do.
 
-The ratio of the contrasts within and outside, and the ink's width, are therefore two more unknowns,
-with priors about 1 and 0. They enter after the adjustment, by one Gauss-Newton step, as all else is
-at its optimum then.
+So the ratio of the contrasts within and outside, and the width of the ink, are two more unknowns,
+with priors around 1 and 0. They are estimated after the adjustment, by one Gauss-Newton step, since
+all other unknowns are at their optimum then.
 """
 
 from __future__ import annotations
@@ -24,22 +25,23 @@ from kgcp.measurement.discs.disc_levels import GEOMETRY_COUNT
 from kgcp.measurement.discs.fit_disc import DiscFit, DiscState
 
 _PRIOR_SD = 0.1  # of the ratio
-_STEP = 1e-3  # of the white share and of the outer radius, for differences
-_MOST_OFF, _LEAST_SIGMAS = 0.2, 4.0
+_STEP = 1e-3  # of white share and outer radius, for numerical derivatives
+_MOST_OFF, _LEAST_SIGMAS = 0.2, 4.0  # largest deviation of the ratio from 1; in deviations
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RingUnknowns:
-    """The contrast within a ring over that outside it, its ink's width, and what both displace.
+    """Ratio of a ring's contrasts and width of its ink, and their effect on the geometry.
 
     Attributes
     ----------
     ratio, sd : float
-        Of the contrasts, by the pixels alone.
+        Contrast within the ring divided by that outside it, and its standard deviation, from the
+        pixels alone, without a prior.
     correction : (5,) array
-        Of the geometry: what the likeliest ratio and width of the ink make of it.
+        Of the geometry, for the likeliest ratio and width.
     cov : (5, 5) array
-        What not knowing the two adds to the geometry's covariance.
+        Added to the geometry's covariance, since the two are not known exactly.
     """
 
     ratio: float
@@ -50,7 +52,7 @@ class RingUnknowns:
     @classmethod
     def of(cls, fit: DiscFit) -> RingUnknowns:
         """Linearise at an adjusted ring."""
-        changes = np.array([_STEP * _within(fit), _wider_ink(fit)])
+        changes = np.array([_STEP * _share_by_ratio(fit), _change_by_width(fit)])
         slopes = _levels_changed(fit, changes) / (_STEP * fit.sd)
         shared = fit.scaled @ (fit.misfit.weight * slopes).T
         by_both = np.linalg.solve(fit.normal, shared)
@@ -66,27 +68,27 @@ class RingUnknowns:
 
     @property
     def is_seen(self) -> bool:
-        """Whether the areas within are there, about as bright as the ground."""
+        """Whether the areas within are there, and about as bright as the ground."""
         tolerance = max(_MOST_OFF, _LEAST_SIGMAS * self.sd)
         return abs(self.ratio - 1.0) < tolerance and self.ratio > _LEAST_SIGMAS * self.sd
 
     def corrected(self, state: DiscState) -> DiscState:
-        """Return a state whose geometry is that of the likeliest ratio and width."""
+        """Return a state with the corrected geometry."""
         vector = state.vector.copy()
         vector[:GEOMETRY_COUNT] += self.correction
         return DiscState(vector)
 
 
-def _within(fit: DiscFit) -> FloatArray:
-    """Return the change (n,) of the white share by the contrast within."""
+def _share_by_ratio(fit: DiscFit) -> FloatArray:
+    """Return the derivative (n,) of the white share by the ratio of the contrasts."""
     pixels, state = fit.sample.pixels, fit.state
     return np.asarray(pixels.circles[1:, 3] @ pixels.shares_within(state.geometry, state.blur)[1:])
 
 
-def _wider_ink(fit: DiscFit) -> FloatArray:
-    """Return the change (n,) of the white share if ink goes farther beyond each circle by a step.
+def _change_by_width(fit: DiscFit) -> FloatArray:
+    """Return the change (n,) of the white share if the ink reaches farther beyond every circle.
 
-    The step is `_STEP` outer radii.
+    It reaches farther by `_STEP` outer radii.
     """
     pixels, state = fit.sample.pixels, fit.state
     circles = pixels.circles.copy()
@@ -97,7 +99,7 @@ def _wider_ink(fit: DiscFit) -> FloatArray:
 
 
 def _levels_changed(fit: DiscFit, changes: FloatArray) -> FloatArray:
-    """Return the changes (k, n) of the grey values that go with those of the white share (k, n)."""
+    """Return the changes (k, n) of the grey values for some changes (k, n) of the white share."""
     pixels, state = fit.sample.pixels, fit.state
     share = pixels.white_share(state.geometry, state.blur)
     changed = [replace(share, value=share.value + change) for change in changes]

@@ -1,14 +1,15 @@
 """The edge of a disc on ground that has a texture.
 
-Texture is no noise of single pixels. It is correlated, and a pixel has it only as far as it sees
-the ground. With h the derivative of a pixel's grey value with respect to the ground's light, s the
-texture's standard deviation, ρ its correlation and σ the noise of pixels, the residuals have the
-covariance
+Texture is not like the noise of pixels: it is correlated, and a pixel shows it only as far as it
+sees the ground. The residuals have the covariance
 
-    Σ = s² h hᵀ ∘ ρ + σ² I.
+    Σ = s² h hᵀ ∘ ρ + σ² I
 
-Least squares with Σ⁻¹ make most of the inner side of the edge, where little of the ground is left,
-and predict the texture at the edge from the ground beside it.
+with the derivative h of a pixel's grey value by the light of the ground, the texture's standard
+deviation s and correlation ρ, and the noise σ of pixels.
+
+Least squares with the weights Σ⁻¹ rely most on the inner side of the edge, where pixels see little
+of the ground, and predict the texture at the edge from the ground beside it.
 """
 
 from __future__ import annotations
@@ -48,44 +49,45 @@ from kgcp.measurement.discs.pixel_choice import choose_pixels
 from kgcp.measurement.image_model.blur import REACH_SIGMAS
 from kgcp.measurement.image_model.noise import find_censoring
 
-# Tuning; `benchmarks.ground.plain_targets --kind "bare white disc"` has errors and deviations.
+# Tuning: `benchmarks.ground.plain_targets --kind "bare white disc"` shows errors and deviations.
 _ROUNDS, _TEXTURE_ROUNDS = 5, 2
-_SETTLED_PX = 0.001  # a step that ends the rounds
-_UNSETTLED_PX = 0.02  # a last step that leaves no result
-# Pixels in a sector: of 150, deviations are 7 % smaller than errors; of 400, 2 %.
+_SETTLED_PX = 0.001  # a smaller step ends the rounds
+_UNSETTLED_PX = 0.02  # if the last step is larger, there is no result
+# Most pixels of a sector. With 150, stated deviations are 7 % smaller than errors; with 400, 2 %.
 _MOST_PIXELS = 400
-_MOST_IN_MODES, _TEXTURE_SECTORS = 150, 8  # of those that tell the texture
-_EVERY_OF_MIDDLE = 7  # of the disc's middle, which tells its level
-# Share of the ground that a pixel sees: at least, to tell the texture; at most, to be on the disc
+_MOST_IN_MODES, _TEXTURE_SECTORS = 150, 8  # pixels, and number, of sectors that tell the texture
+_EVERY_OF_MIDDLE = 7  # one in so many pixels of the disc's middle is used: for its level
+# Pixels that see at least this share of ground tell the texture; those that see at most this share
+# are on the disc.
 _GROUND, _DISC = 0.98, 0.5
 _FEWEST = 10  # pixels, to tell noise or texture
-_OF_DISC = 2  # parameters that the disc's pixels alone tell: level and blur
-_MUCH_CLIPPED = 0.05  # share of the disc's pixels, or of the ground's
-# A larger disc lies on more than one kind of ground: half on grass and half on asphalt, errors at R
-# 25 px were 1.5 times what one texture makes of them. Its variances are not below those of
-# independent pixels.
+_DISC_PARAMETERS = 2  # level and blur, which the disc's pixels determine alone
+_MUCH_CLIPPED = 0.05  # largest share of clipped pixels on the disc, and on the ground
+# Discs above this radius may lie on more than one kind of ground. Half on grass and half on
+# asphalt, errors at R 25 px were 1.5 times the deviations of a single texture. So their variances
+# are taken to be at least those of independent pixels.
 _ONE_GROUND_PX = 20.0
-_LEAST_NOISE_COUNTS = 0.3  # quantisation alone
+_LEAST_NOISE_COUNTS = 0.3  # of quantisation alone
 _SLOPES = np.array((Row.SLOPE_X, Row.SLOPE_Y))
 
 
 def fit_on_texture(
     fit: DiscFit, scatter: DiscScatter, others: Sequence[Geometry]
 ) -> tuple[DiscFit, DiscScatter]:
-    """Adjust a disc anew, with the covariance of the ground's texture.
+    """Adjust a disc again, with the covariance of the ground's texture.
 
     Parameters
     ----------
     fit, scatter
-        As adjusted to noise of single pixels.
+        Of the adjustment with independent pixels.
     others : sequence of Geometry
         Edges whose pixels are left out.
 
     Raises
     ------
     NoFit
-        If the equations cannot be solved or do not settle, if disc or ground are burnt, or hardly
-        any ground is left.
+        If the equations cannot be solved, the steps do not settle, disc or ground are burnt, or
+        hardly any ground is left.
     """
     sample, state = _sample_with_all_ground(fit, others), fit.state
     now = _linearised(fit, sample, state)
@@ -123,7 +125,7 @@ def fit_on_texture(
 
 
 def _ground_share(fit: DiscFit) -> FloatArray:
-    """Return how much (n,) of every pixel sees the ground."""
+    """Return the share (n,) of every pixel that sees the ground."""
     return fit.share if fit.sample.pixels.is_dark else 1.0 - fit.share
 
 
@@ -132,21 +134,21 @@ def _linearised(fit: DiscFit, sample: DiscSample, state: DiscState) -> DiscFit:
 
 
 def _noise(fit: DiscFit) -> float:
-    """Return the noise of pixels, from those of the disc."""
+    """Return the noise of pixels, from those within the disc."""
     seen, count = np.flatnonzero(_is_seen(fit)), fit.sample.window.levels_per_count
     share = _ground_share(fit)[seen]
     within = seen[share < 1.0 - _GROUND]
     if len(within) < _FEWEST:
         within = seen[np.argsort(share, kind="stable")[:_FEWEST]]
     residuals = (fit.sample.levels - fit.levels)[within]
-    variance = float(residuals @ residuals) / (len(within) - _OF_DISC)
+    variance = float(residuals @ residuals) / (len(within) - _DISC_PARAMETERS)
     return math.sqrt(max(variance, (_LEAST_NOISE_COUNTS * count) ** 2))
 
 
 def _sample_with_all_ground(fit: DiscFit, others: Sequence[Geometry]) -> DiscSample:
-    """Return a sample in which no pixel around the edge is left out, but those of foreign things.
+    """Return a sample of all pixels around the edge, without those of foreign things.
 
-    Neighbouring pixels tell the texture.
+    No pixel is left out to save time: it is neighbouring pixels that tell the texture.
     """
     before, state, window = fit.sample, fit.state, fit.sample.window
     index, _ = choose_pixels(window, state.geometry, state.blur, others, is_thinned=False)
@@ -181,7 +183,7 @@ def _by_ground(fit: DiscFit) -> FloatArray:
 
 
 def _is_seen(fit: DiscFit) -> BoolArray:
-    """Return which pixels (n,) are not clipped; others agree with the model, as far as it goes."""
+    """Return which pixels (n,) are not clipped, or are but are modelled below the limit."""
     limits = fit.sample.censoring
     is_clipped = (limits.at_high & (fit.levels >= limits.high)) | (
         limits.at_low & (fit.levels <= limits.low)
@@ -192,7 +194,7 @@ def _is_seen(fit: DiscFit) -> BoolArray:
 def _equations(
     fit: DiscFit, sectors: Sequence[Sector], texture: GroundTexture, noise: float
 ) -> FloatArray:
-    """Return the equations (k, p, p + 1) of each sector: normal matrix and gradient."""
+    """Return the equations (k, p, p + 1) of k sectors: normal matrix, and gradient in the end."""
     rows, by_ground, seen = fit.jacobian[fit.free.rows], _by_ground(fit), _is_seen(fit)
     both = np.vstack((rows, fit.sample.levels - fit.levels)).T
     products = np.zeros((len(sectors), len(rows), len(rows) + 1))
@@ -218,9 +220,10 @@ def _with_priors(fit: DiscFit, equations: FloatArray) -> tuple[FloatArray, Float
 def _scatter(
     plain: DiscScatter, state: DiscState, normal: FloatArray, of_arcs: FloatArray
 ) -> DiscScatter:
-    """Return the covariance's parts, by the equations (arcs, p, p + 1) of the arcs.
+    """Return the parts of the covariance, from the equations (arcs, p, p + 1) of arcs.
 
-    A stone or a painted line at the edge is no texture: it pulls at one arc.
+    A stone or a painted line at the edge is no texture. It displaces one arc, and so shows in the
+    scatter over arcs.
     """
     inverse: FloatArray = np.linalg.inv(normal).astype(np.float64)
     own = inverse[:GEOMETRY_COUNT]

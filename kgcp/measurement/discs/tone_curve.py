@@ -1,13 +1,13 @@
 """The tone curve of a camera, over the whole range of grey values.
 
 All discs of all photographs share it, whatever their levels. It is a known curve, sRGB's or a
-straight line, of which the grey value y is bent by three waves:
+straight line, whose grey value y is bent by three waves:
 
     grey = y + Σ tₖ sin(kπy) / kπ,  k = 1, 2, 3
 
-so that black stays black and white stays white, and tₖ is what the slope changes by. The first wave
-is a gamma, the second the S that cameras add for contrast (trigonometric response models: Grossberg
-& Nayar, "What is the space of camera response functions?", CVPR 2003).
+Black stays black and white stays white, and tₖ is the amplitude of the change of slope. The first
+wave acts like a gamma, the second is the S that cameras add for contrast (trigonometric response
+models: Grossberg & Nayar, "What is the space of camera response functions?", CVPR 2003).
 """
 
 from __future__ import annotations
@@ -23,11 +23,12 @@ from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.image_model.srgb import srgb_decoded, srgb_encoded
 
 WAVES = 3
-_LEAST_SLOPE = 0.35  # of the bent curve relative to the known one, …
-_DARKEST, _BRIGHTEST = 0.05, 0.95  # … between these grey values
-# No camera makes its darks darker than they are, but for errors of the black level: least first
-# wave of sRGB's curve, which at -0.95 is nearly a straight line, and of a straight line. The former
-# acts beside a positive second wave; alone, `_LEAST_SLOPE` stops the first one at -0.66.
+_LEAST_SLOPE = 0.35  # of the bent curve relative to the known one
+_DARKEST, _BRIGHTEST = 0.05, 0.95  # grey values between which that is required
+# Least first wave, for sRGB's curve and for a straight line: no camera makes its darks darker than
+# they are, except by an error of the black level. (At -0.95, sRGB's curve would be nearly a
+# straight line.) The limit for sRGB matters only beside a positive second wave; without one,
+# `_LEAST_SLOPE` stops the first wave at -0.66.
 _LEAST_GAMMA = (-0.8, -0.15)
 _NEWTON_STEPS = 20
 
@@ -39,9 +40,9 @@ class DiscTone:
     Attributes
     ----------
     tone : Tone
-        Which known curve, and whether it is bent.
+        Which known curve it is, and whether it may be bent.
     waves : (3,) tuple of float
-        Amplitudes of the waves; zeros: it is not.
+        Amplitudes of the waves; zeros: it is not bent.
     """
 
     tone: Tone
@@ -64,10 +65,10 @@ class DiscTone:
 
 
 def plausible(waves: FloatArray, tone: Tone) -> FloatArray:
-    """Return amplitudes (3,) of a curve that a camera can have.
+    """Return the amplitudes (3,), limited to those of a curve that a camera can have.
 
-    The skirts of a point spread look like a curve that darkens the dark: light that is scattered
-    from the ground onto a disc is as much brighter near its edge.
+    The first wave has a lower limit because the skirts of a point spread imitate a curve that makes
+    darks darker: they scatter light from the ground onto a disc, more of it near the edge.
     """
     waves = waves.copy()
     waves[0] = max(waves[0], _least_gamma(tone))
@@ -79,18 +80,19 @@ def _least_gamma(tone: Tone) -> float:
 
 
 def steep_enough(waves: FloatArray) -> FloatArray:
-    """Return amplitudes (3,) that are small enough for the curve to rise everywhere.
+    """Return the amplitudes (3,), reduced until the curve is steep enough everywhere.
 
-    Where it is flat, the ground shows no gradient of the light however large it is, and the
-    gradient explains whatever makes opposite edges differ: coma, or the order of the rows.
+    Where a curve is flat, a gradient of the light does not show on the ground, however large it is.
+    The gradient would then explain whatever makes opposite edges differ: coma, or the order of the
+    rows.
     """
     steepest_fall = -float((waves @ _slopes_of_waves()).min())
-    room = 1.0 - _LEAST_SLOPE
-    return waves * (room / steepest_fall) if steepest_fall > room else waves
+    most = 1.0 - _LEAST_SLOPE
+    return waves * (most / steepest_fall) if steepest_fall > most else waves
 
 
 def wave_limits(tone: Tone) -> tuple[FloatArray, FloatArray]:
-    """Return what `plausible` asks of amplitudes: rows (m, 3) whose products are at least (m,)."""
+    """Return the limits of `plausible`: rows (m, 3), and their least products (m,) with waves."""
     slopes = _slopes_of_waves().T
     rows = np.vstack((slopes, (1.0, 0.0, 0.0)))
     least = np.full(len(rows), _LEAST_SLOPE - 1.0)
@@ -106,7 +108,7 @@ def _slopes_of_waves() -> FloatArray:
 
 @compiled
 def bend(known: FloatArray, waves: FloatArray) -> FloatArray:
-    """Return the grey values of what a known curve gives; beyond 0…1 it goes on straight."""
+    """Return the grey values of a known curve after bending; a straight line beyond 0…1."""
     level = np.empty(len(known))
     for i in range(len(known)):
         within = min(max(known[i], 0.0), 1.0)
@@ -121,7 +123,7 @@ def bend(known: FloatArray, waves: FloatArray) -> FloatArray:
 
 @compiled
 def _straightened(levels: FloatArray, waves: FloatArray) -> FloatArray:
-    """Return what `bend` makes these grey values of: Newton's method, kept from leaving 0…1."""
+    """Return the inverse of `bend`, by Newton's method within 0…1."""
     known = np.empty(len(levels))
     for i in range(len(levels)):
         low, high, at = 0.0, 1.0, min(max(levels[i], 0.0), 1.0)
@@ -133,7 +135,7 @@ def _straightened(levels: FloatArray, waves: FloatArray) -> FloatArray:
                 slope += waves[k] * np.cos(turn * at)
             low, high = (at, high) if bent < levels[i] else (low, at)
             step = (levels[i] - bent) / slope
-            if levels[i] <= 0.0 or levels[i] >= 1.0:  # where the curve goes on straight
+            if levels[i] <= 0.0 or levels[i] >= 1.0:  # where the curve is a straight line
                 at += step
                 break
             at = at + step if low <= at + step <= high else 0.5 * (low + high)

@@ -11,7 +11,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.discs.adjust_disc import DiscTask, adjust_disc
-from kgcp.measurement.discs.camera_tone import _with_waves, _worthy, learn_tone
+from kgcp.measurement.discs.camera_tone import _with_waves, _worth_comparing, learn_tone
 from kgcp.measurement.discs.disc_levels import COUNT, Row
 from kgcp.measurement.discs.fit_disc import DiscState, DiscUnknowns
 from kgcp.measurement.discs.joint_tone import JointFit, adjust_together
@@ -50,8 +50,8 @@ def test_bent_curves_that_are_nearly_as_likely_are_compared_by_their_own_masks(
 ) -> None:
     plain = [joint(Tone.SRGB, 1000.0), joint(Tone.LINEAR, 1200.0)]
     bent = [joint(Tone.UNKNOWN, of_srgb), joint(Tone.UNKNOWN_FROM_LINE, of_line)]
-    assert {each.tone for each in _worthy(plain, bent)} == worthy
-    assert {each.tone for each in _worthy(plain, [])} == {Tone.SRGB}
+    assert {each.tone for each in _worth_comparing(plain, bent)} == worthy
+    assert {each.tone for each in _worth_comparing(plain, [])} == {Tone.SRGB}
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_a_line_is_bent_itself_unless_srgb_s_curve_is_much_likelier(
 ) -> None:
     plain = [joint(Tone.SRGB, 1200.0), joint(Tone.LINEAR, 1000.0)]
     bent = [joint(Tone.UNKNOWN, 700.0), joint(Tone.UNKNOWN_FROM_LINE, of_line)]
-    assert {each.tone for each in _worthy(plain, bent)} == worthy
+    assert {each.tone for each in _worth_comparing(plain, bent)} == worthy
 
 
 @pytest.mark.parametrize(
