@@ -50,7 +50,7 @@ from kgcp.measurement.discs.measure import measure_discs
 from kgcp.measurement.discs.outlines import find_outlines, follow_outlines
 from kgcp.measurement.discs.records import Operator
 from kgcp.measurement.plain_prediction import PlainPrediction
-from kgcp.measurement.plain_target import look_for_plain
+from kgcp.measurement.plain_target import measure_plain
 from kgcp.measurement.plate_prior import NormalPrior
 from kgcp.measurement.records import FrameResult
 from kgcp.pipeline.execution.journal import from_text
@@ -240,7 +240,7 @@ def plain_targets(data: bytes, folder: Path) -> None:  # noqa: ARG001 - as all t
         prediction = PlainPrediction(
             centre_px, 9.0 * np.eye(2), position_m, 0.1, normal, 50.0 * diameters_m[0], "fuzzing"
         )
-        look_for_plain(grey, camera, target, prediction)
+        measure_plain(grey, camera, target, prediction)
 
 
 def marks(data: bytes, folder: Path) -> None:

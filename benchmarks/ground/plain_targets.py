@@ -32,7 +32,7 @@ from kgcp.measurement.discs.ground_texture import GroundTexture, TextureModes, s
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.plain_pose import CircleMoments, circles_about, fit_circles, pose_towards
 from kgcp.measurement.plain_prediction import SIGMAS, PlainPrediction, smallest_radius_px
-from kgcp.measurement.plain_target import look_for_plain
+from kgcp.measurement.plain_target import measure_plain
 from kgcp.measurement.plate_prior import NormalPrior
 from kgcp.measurement.records import Measurement
 from kgcp.pipeline.execution.threads import single_threaded
@@ -156,7 +156,7 @@ def look(
         prediction = _prediction(camera, pose, stated, radius_px, rng)
         prediction = replace(prediction, normal=None) if is_free else prediction
         began = time.perf_counter()
-        outcome = look_for_plain(grey, camera, target, prediction)
+        outcome = measure_plain(grey, camera, target, prediction)
         seconds += time.perf_counter() - began
         if not isinstance(outcome, Measurement):
             reasons[outcome.reason.value] += 1
@@ -458,7 +458,7 @@ def _looked_at(
             radius_px,
             "a benchmark",
         )
-        outcome = look_for_plain(photograph, camera, target, prediction)
+        outcome = measure_plain(photograph, camera, target, prediction)
         windows += 1
         if isinstance(outcome, Measurement):
             wrong += 1

@@ -1,4 +1,4 @@
-"""Why the best candidate of a frame was not the target, in the words of the registry."""
+"""Why the best candidate of a frame was not measured as the target: one of the reasons."""
 
 from __future__ import annotations
 
@@ -17,26 +17,27 @@ from kgcp.measurement.search.template_match import CODE_LIKE, match_templates, p
 from kgcp.measurement.search.templates import SAMPLED_RADII
 from kgcp.targets.layout import Ring, Target
 
-# Shares from which on something is the reason why a target was not measured. They only choose the
-# word of a miss: the sets of `benchmarks.search.hard_frames` are named for these words.
-_CUT = 0.1  # of the outline outside the frame
-_FAINT_DOTS = 0.25  # of the ring's contrast
-_UNSEEN = 0.15  # of the outer edge
-# Quantile of the steps that belongs to the visible part, and the least step of an edge, relative to
-# that.
-_SEEN, _EDGE_STEP = 0.75, 0.4
-_BURNT = 0.9  # of the pixels on disc and plate
-_INK, _PLATE, _HALF_BAND = 0.9, 1.1, 0.04  # circles either side of the outer edge, of its radius
-_DISC = 0.8  # of the inner radius
+# Limits beyond which something is the reason why a target was not measured. They only choose the
+# reason of a miss; the sets of `benchmarks.search.hard_frames` are named after these reasons.
+_CUT = 0.1  # share of the outline that is outside the frame
+_FAINT_DOTS = 0.25  # contrast of the dots, relative to the ring's
+_UNSEEN = 0.15  # share of the outer edge that is not seen
+# This quantile of the steps of grey values across the outer edge stands for its visible part. Where
+# a step is smaller than this share of it, the edge is not seen.
+_VISIBLE_QUANTILE, _EDGE_STEP = 0.75, 0.4
+_BURNT = 0.9  # share of burnt pixels on disc and plate
+_INK, _PLATE, _HALF_BAND = 0.9, 1.1, 0.04  # circles either side of the outer edge, in its radii
+_DISC = 0.8  # of the inner radius: pixels within show the inner disc
 _WRONG_CODE = {Reason.OTHER_CODE, Reason.CODE_MISMATCH}
-_CONCENTRIC, _SAME_SCALE = 0.3, 0.2  # of a replica's radius; relative
+_CONCENTRIC, _SAME_SCALE = 0.3, 0.2  # largest offset in a replica's radii, and relative size error
 
 
 def ring_to_explain(target: Target, considered: Sequence[Considered]) -> Considered:
-    """Return the candidate whose failure explains a miss: the best, or the main ring around it.
+    """Return the candidate whose failure explains a miss: the best one, or the main ring around it.
 
-    A candidate that carried the code is better than any that did not, whatever their scores. But
-    if a replica carries its code and the main ring around it does not, the latter has failed.
+    A candidate that carries the code is better than any that does not, whatever their scores. But
+    if the best one is a replica with its code, inside a main ring without its code, the miss is
+    explained by the main ring.
 
     Parameters
     ----------
@@ -70,21 +71,21 @@ def explain(
     min_radius_px: float,
     targets: Sequence[Target] = (),
 ) -> Considered:
-    """Give a dropped candidate the reason that lies in the image, where one is plain to see.
+    """Give a dropped candidate a reason that is visible in the image, if there is one.
 
-    A ring that is hardly like the target keeps its reason: it is something else, and how it is
-    seen does not matter. The detail begins with where the ring is.
+    A ring that is hardly like the target keeps its reason: it is something else, whatever its
+    image. The detail begins with the place of the ring.
 
     Parameters
     ----------
     target : Target
-        One of whose rings it was compared with.
+        The target with whose ring it was compared.
     candidate : Considered
         Dropped by one of the tests.
     min_radius_px : float
         Smallest radius that is looked for [px].
     targets : sequence of Target
-        All of the flight, whose code the ring may carry instead.
+        All targets of the flight: the ring may carry the code of another one.
     """
     outline = candidate.outline
     ring = next(ring for ring in target.rings if ring.name == candidate.ring)
@@ -109,7 +110,7 @@ def explain(
 def _plain_cause(
     grey: GreyArray, ring: Ring, outline: Ellipse, min_radius_px: float
 ) -> tuple[Reason, str] | None:
-    """Return the first cause that applies, of those that leave the least to measure first."""
+    """Return the first cause that applies, beginning with those that leave the least to measure."""
     outside = _share_outside(grey, outline)
     if outside > _CUT:
         return Reason.CUT, f"{outside:.0%} of it outside the frame"
@@ -140,7 +141,7 @@ def _share_unseen(patch: FloatArray) -> float:
         patch[np.abs(SAMPLED_RADII - middle) < _HALF_BAND].mean(axis=0) for middle in (_INK, _PLATE)
     )
     step = plate - ink
-    return float(np.mean(step < _EDGE_STEP * np.quantile(step, _SEEN)))
+    return float(np.mean(step < _EDGE_STEP * np.quantile(step, _VISIBLE_QUANTILE)))
 
 
 def _share_burnt(patch: FloatArray, ring: Ring, limit: float) -> float:

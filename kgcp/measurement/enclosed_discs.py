@@ -1,4 +1,4 @@
-"""Groups of discs within one closed boundary: what an EO device looks like before it has names."""
+"""Groups of discs within one closed boundary: an EO device, before its discs are named."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from kgcp.measurement.discs.measure import measure_discs
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.discs.records import Disc, Polarity
 
-_LEVELS = (0.25, 0.5, 0.75)  # between the levels of discs and ground, where a boundary is cut
-_LEAST_AREA = 3.0  # of a region, over that of its discs
+_LEVELS = (0.25, 0.5, 0.75)  # thresholds of a boundary, between the levels of discs and ground
+_LEAST_AREA = 3.0  # of a region, relative to the area of its discs
 
 
 def enclosed_discs(grey: GreyArray, count: int, response: Response) -> list[list[Disc]]:
     """Find closed regions with exactly so many discs of one polarity.
 
-    A boundary is any closed shape: a line around the discs, or the edge of a plate. Of regions with
-    the same discs one is kept.
+    A boundary is any closed shape: a line around the discs, or the edge of a plate. Regions with
+    the same discs count once.
 
     Parameters
     ----------
     grey : (height, width) array
         Grey values of 8 or 16 bits.
     count : int
-        Discs in the region.
+        Number of discs in a region.
     response : Response
         How grey values follow light.
 
@@ -50,9 +50,9 @@ def enclosed_discs(grey: GreyArray, count: int, response: Response) -> list[list
 
 
 def _groups(
-    grey: GreyArray, discs: list[Disc], names: list[int], count: int
+    grey: GreyArray, discs: list[Disc], numbers: list[int], count: int
 ) -> set[tuple[int, ...]]:
-    """Return the discs that lie in one hole of a region above or below a level."""
+    """Return groups of `count` discs in one hole of a region that is above or below a level."""
     places = np.array([disc.centre_px for disc in discs])
     areas = np.array([4.0 * np.pi * _root_determinant(disc) for disc in discs])
     groups = set()
@@ -73,12 +73,12 @@ def _groups(
         ]
         is_large = cv2.contourArea(contour) > _LEAST_AREA * areas[inside].sum()
         if len(inside) == count and is_large:
-            groups.add(tuple(names[i] for i in inside))
+            groups.add(tuple(numbers[i] for i in inside))
     return groups
 
 
 def _holes(grey: GreyArray, discs: list[Disc]) -> list[MatLike]:
-    """Return the contours of holes, by levels between those of the discs and of their ground."""
+    """Return the contours of holes, for thresholds between the levels of discs and ground."""
     full = full_scale(grey)
     inside = float(np.median([disc.inside for disc in discs]))
     outside = float(np.median([disc.outside for disc in discs]))

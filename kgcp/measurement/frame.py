@@ -26,17 +26,20 @@ from kgcp.measurement.search.template_match import match_templates_at
 from kgcp.settings import DetectSettings, Method
 from kgcp.targets.layout import Ring, Target
 
-_MIN_VISIBLE = 0.3  # of the main ring's code circle, for a replica to be compared with it
+# If at least this share of the main ring's code circle is in the frame, a replica is accepted only
+# if the main ring shows the target's code, with this score or with this heading relative to the
+# replica
+_MIN_VISIBLE = 0.3
 _MIN_MAIN_SCORE = 0.75
-_MOST_TURNED_DEG = 8.0  # of the main ring's heading from the replica's
+_MOST_TURNED_DEG = 8.0
 
 
 @dataclass(frozen=True, slots=True)
 class Examination:
     """What one frame says about all targets."""
 
-    # in the order of the targets; of each either its plates as observations, instance 0, 1, … in
-    # order of score, or one Miss with the reason of its best candidate
+    # in the order of the targets; for each target either its plates as measurements, instance 0, 1,
+    # … in order of score, or one Miss with the reason of its best candidate
     outcomes: tuple[Outcome, ...]
     considered: tuple[Considered, ...]  # all rings that were compared with a target's
 
@@ -65,9 +68,9 @@ def examine(
     grey : (height, width) array
         Raw frame, uint8 or uint16, of the camera's size.
     targets : tuple of Target
-        All that may be seen.
+        All targets that may be seen.
     priors : mapping of str to PlatePrior, optional
-        What is known of targets before, by name.
+        What is known of targets beforehand, by their names.
     measured : sequence of Measurement
         Targets of this frame that are already measured.
     """
@@ -101,7 +104,7 @@ def examine(
 def _undisputed(
     plates: tuple[Measurement, ...], rivals: list[Measurement]
 ) -> tuple[Measurement, ...]:
-    """Leave out plates that look more like another target's; number the others by score."""
+    """Leave out plates that look more like another target; number the others by score."""
     kept = [
         plate
         for plate in plates
@@ -124,7 +127,7 @@ def _try_target(
     settings: DetectSettings,
     prior: PlatePrior,
 ) -> _Trial:
-    """Measure all plates of one target; its replicas serve where the main ring cannot."""
+    """Measure all plates of one target, by a replica where the main ring is not measured."""
     plates: list[Measurement] = []
     considered: list[Considered] = []
     for ring in target.rings:
@@ -166,12 +169,12 @@ def measure_match(
     settings: DetectSettings,
     prior: PlatePrior,
 ) -> Measurement:
-    """Measure a matched ring by the method of the settings, and make sure that it is the target.
+    """Measure a matched ring by the method of the settings, and check that it is the target.
 
     Raises
     ------
     Rejection
-        With the reason of the first test that is not passed.
+        With the reason of the first test that fails.
     """
     if settings.method is Method.PAPER:
         observation = measure_ring(grey, camera, target, match)
@@ -192,10 +195,7 @@ def _check_plate(
     pose: Pose,
     settings: DetectSettings,
 ) -> BoolArray | None:
-    """Refuse a plate that does not look like the target; return where it is visible.
-
-    None means that all of it is.
-    """
+    """Refuse a plate that does not look like the target; return where it is visible; None: all."""
     template_match = match_templates_at(grey, camera, pose, ring)
     template_match.check(settings.min_score)
     if ring is target.ring:
@@ -215,7 +215,7 @@ def miss_of(
     Parameters
     ----------
     targets : sequence of Target
-        All that may be seen, whose code the candidate may carry instead.
+        All targets that may be seen: the candidate may carry the code of another one.
     """
     if not considered:
         return Miss(target.name, Reason.NO_CANDIDATE)
@@ -234,10 +234,11 @@ def _check_main_ring(
     pose: Pose,
     settings: DetectSettings,
 ) -> BoolArray | None:
-    """Refuse a replica that sits on a plate with another main code; return where that is seen.
+    """Refuse a replica on a plate with another main code; return where the main ring is visible.
 
-    Plates of several targets may carry the same small ring. Where enough of the main ring is in
-    the frame it must show its code at the heading of the replica.
+    Plates of several targets may carry the same small ring. If enough of the main ring is in the
+    frame, it must show its code at the heading of the replica. None: it is not looked at, or all of
+    it is visible.
     """
     points = points_of_code(camera, pose, main)
     height, width = grey.shape

@@ -1,4 +1,4 @@
-"""A second look: at a small part of a frame, for a target that must be there."""
+"""The second look: a target is looked for in the small part of a frame where it must be."""
 
 from __future__ import annotations
 
@@ -21,27 +21,30 @@ from kgcp.measurement.search.template_match import match_templates, polar_patch
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
 
-# Tuning of the second look; its benchmark is the table in docs/method.md, "The second pass": four
+# Tuning of the second look. Its benchmark is the table in docs/method.md, "The second pass": four
 # simulated flights, with the targets that the second look adds.
-_SIGMAS = 4.0  # of the prediction, in place and radius
-_SMALLEST_PX = 3.0  # radius of a ring that is looked for
-_FARTHEST = 8.0  # largest uncertainty of the place, in radii: beyond, a prediction is of little use
-_LARGEST_RATIO = 2.0  # of the radius to the expected one
-_SPACING, _RATIO = 0.35, 1.25  # of the places and radii that rings are tracked from
-_LOWER_SCORE = 0.06
-_WORTH_A_TRY = 0.5  # score of the whole ring
-_TRIES = 4  # per ring, the best candidates
+_SIGMAS = 4.0  # largest deviation from the prediction, in place and radius
+_SMALLEST_PX = 3.0  # least radius of a ring that is looked for
+_FARTHEST = 8.0  # largest deviation of the place in radii at which a prediction is of use
+_LARGEST_RATIO = 2.0  # largest ratio of a radius to the predicted one at which it is of use
+_SPACING, _RATIO = (
+    0.35,
+    1.25,
+)  # steps of places (in radii), and of radii, that rings are tracked from
+_LOWER_SCORE = 0.06  # by so much the score may be lower than in the first look
+_MIN_SCORE_TO_TRY = 0.5  # of the whole ring
+_TRIES = 4  # per ring: only the best candidates are measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """Where a target must be in a frame, and how large, with deviations."""
+    """Where a target must be in a frame, and how large it is, with standard deviations."""
 
     centre_px: FloatArray  # (2,): projected centre [px]
     sd_px: float  # standard deviation of either coordinate [px]
     radius_px: float  # of the main ring [px]
     sd_log_radius: float  # standard deviation of its logarithm
-    source: str  # what it was made from, as one word
+    source: str  # what it was made from, in one word
 
     def __str__(self) -> str:
         """Text for the detail of a row."""
@@ -82,7 +85,7 @@ class Prediction:
             raise Rejection(Reason.POOR_FIT, f"{off_px:.1f} px and {ratio - 1.0:+.0%} off; {self}")
 
 
-def look_again(
+def measure_guided(
     grey: GreyArray,
     camera: Camera,
     target: Target,
@@ -91,11 +94,11 @@ def look_again(
     prior: PlatePrior,
     rivals: Sequence[Measurement],
 ) -> tuple[Measurement | None, tuple[Considered, ...]]:
-    """Look for one target where it must be, however faint its ring is.
+    """Look for one target where it must be, even if its ring is faint.
 
     Rings are tracked from all possible places and radii, without the ring filter and the ring
-    check. A measurement must agree with the prediction and pass all tests of a first look, with
-    a slightly lower score of the ring.
+    check. A measurement must agree with the prediction and pass all tests of the first look, but
+    with a slightly lower score of the ring.
 
     Parameters
     ----------
@@ -105,8 +108,9 @@ def look_again(
     Returns
     -------
     observation : Measurement or None
-        The first that passes, the main ring's candidates tried before the replicas'.
+        The first that passes. The main ring's candidates are tried before the replicas'.
     considered : tuple of Considered
+        All candidates that were tried.
     """
     lowered = replace(settings, min_score=max(settings.min_score - _LOWER_SCORE, 0.01))
     considered = []
@@ -136,7 +140,7 @@ def _candidates(grey: GreyArray, target: Target, prediction: Prediction) -> Iter
             template_match.code_match(ring, outline)
             for outline in _outlines(grey, prediction, scale)
             for template_match in (match_templates(polar_patch(grey, outline), ring, outline.a),)
-            if template_match.score > _WORTH_A_TRY
+            if template_match.score > _MIN_SCORE_TO_TRY
         ]
         matches.sort(key=lambda match: -match.score)
         yield from matches[:_TRIES]

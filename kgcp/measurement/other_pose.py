@@ -1,4 +1,4 @@
-"""Which of two poses is the likelier one, once more is known than the frame itself shows."""
+"""The choice between the two poses of a measurement, by what is known besides the image."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from kgcp.measurement.records import Alternative, Measurement
 
 
 def with_preference(camera: Camera, measurement: Measurement, preference: float) -> Measurement:
-    """Return a measurement whose χ² of the other pose is raised by a preference.
+    """Return a measurement with a preference added to the χ² of its other pose.
 
-    The poses change places if the other one is then the better one. The covariance contains how far
-    they are apart, by how probable the other one has become.
+    If the other pose is then the better one, the two are exchanged. The covariance contains the
+    difference of the poses, weighted by the probability of the other one, and is adapted.
 
     Parameters
     ----------
     preference : float
-        χ² by which the other pose is worse, in addition to its ambiguity.
+        χ² by which the other pose is worse, in addition to its ambiguity; negative: better.
     """
     other = measurement.alternative
     if other is None:

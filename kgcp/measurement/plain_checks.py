@@ -1,4 +1,4 @@
-"""Whether what was measured is the target that a frame must show: place, size, shape, edge."""
+"""Checks that a measured disc or ring is the plain target: its edge, size, place and shape."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from kgcp.measurement.plain_prediction import SIGMAS, PlainPrediction
 from kgcp.targets.plain import PlainTarget
 
 # Tuning; `benchmarks.ground.plain_targets` counts what is found and what is taken for a target.
-# How well the edges of a print in the field are known: pixels (an unknown tone curve displaces
-# them), and of the radius (jagged or dirty edges)
+# Standard deviation of edges of a print in the field: in pixels, since an unknown tone curve
+# displaces them, and in radii, since they may be jagged or dirty
 _EDGE_PX, _EDGE = 0.1, 0.01
-_SIZE_PX, _SIZE = 0.12, 0.015  # the same of an edge as a whole
-# Edge spread, of the smaller semi-axis: beyond, a disc is no more than a smooth blob, of which
-# ground has many. Sharp discs of 2.5 px at 50° have 0.38.
+_SIZE_PX, _SIZE = 0.12, 0.015  # the same for the size of an edge as a whole
+# Largest edge spread, relative to the smaller semi-axis. With more, a disc cannot be told from a
+# smooth blob, of which ground has many. Sharp discs of 2.5 px, tilted by 50°, have 0.38.
 _MOST_BLUR = 0.5
-_ROUGH_PX = 0.075  # what an edge's unevenness may displace the centre by
-_PLACE_PX = 0.1  # of a prediction, at least
-_UNLIKELY = 1e-4  # that a target's own shape has so large a χ²
+_ROUGH_PX = 0.075  # largest displacement of the centre that an uneven edge may cause
+_PLACE_PX = 0.1  # standard deviation of a predicted place, at least
+_UNLIKELY = 1e-4  # probability with which a true target's shape is refused
 
 
 def tolerated(images: CircleMoments) -> CircleMoments:
-    """Add to the covariances what edges in the field are off, besides noise."""
+    """Return the circles with the errors of edges in the field added to their covariances."""
     covs = []
     for moments, cov in zip(images.moments, images.covs, strict=True):
         geometry = geometry_of(moments)
@@ -44,7 +44,7 @@ def tolerated(images: CircleMoments) -> CircleMoments:
 
 
 def check_edge(disc: Disc) -> None:
-    """Refuse an edge that is uneven, as of a stone, or hardly one, as of a shrub.
+    """Refuse an edge that is uneven, like a stone's, or is hardly an edge, like a shrub's.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def check_agreement(
     fit: CirclesFit,
     circles: int,
 ) -> None:
-    """Refuse what has another place, size or shape than the prediction.
+    """Refuse a measurement whose size, place or shape differs from the prediction.
 
     Raises
     ------

@@ -1,10 +1,10 @@
 """The pose of concentric circles from centroids and second moments of their images.
 
-The circles' sizes are known, and roughly how their plane lies. Moments of circles are projected
-through the lens (`geometry.circle_image`), so that the result has neither eccentricity nor
-distortion within the target: its place is that of the circles' centre. The plane's prior is an
-observation like the others. What it leaves open of the centre is therefore in the covariance; so is
-what a rolling shutter does to the image, as far as the motion is not known.
+The sizes of the circles are known, and the normal of their plane approximately. Moments of circles
+are projected through the lens (`geometry.circle_image`). So neither eccentricity nor distortion
+within the target displaces the result: it is the circles' centre. The prior of the normal is an
+observation like the others, so that its uncertainty is in the covariance of the centre. The effect
+of a rolling shutter is, too, as far as the motion is not known.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from kgcp.measurement.image_model.rolling_shutter import motion_per_row
 from kgcp.measurement.plate_prior import NormalPrior, SceneRotation
 
 _STEPS = 12
-_SETTLED = 1e-9  # of the distance, and radians
-_LARGEST_TURN_RAD = 0.3  # of a step
+_SETTLED = 1e-9  # largest last step, relative to the distance and in radians
+_LARGEST_TURN_RAD = 0.3  # in one step
 _TURN = np.linspace(0.0, 2.0 * math.pi, 32, endpoint=False)
-_LEAST_TILT_RAD = 0.05
+_LEAST_TILT_RAD = 0.05  # of a start; at 0 the image does not depend on the tilt
 _ANY_HEADING_RAD2 = math.pi**2 / 3.0  # variance of an unknown angle
 
 
@@ -42,7 +42,7 @@ class CircleMoments:
     moments : (k, 5) array
         Centroids and second moments, as `discs.records.MOMENTS`.
     covs : (k, 5, 5) array
-        Of each circle's moments.
+        Covariance of each circle's moments.
     """
 
     radii_m: FloatArray
@@ -59,9 +59,9 @@ class CirclesFit:
     pose : Pose
         Its x axis is as near to the camera's as the plane allows: circles have no heading.
     pose_cov : (6, 6) array
-        As in `Uncertainty`; about the normal, the variance of an angle that may have any value.
+        As in `Uncertainty`; about the normal, the variance of an unknown angle.
     chi2 : float
-        Of all images and of the plane's prior.
+        Sum over all images and the prior of the normal.
     """
 
     pose: Pose
@@ -70,23 +70,23 @@ class CirclesFit:
 
 
 def pose_towards(centre_m: FloatArray, normal: FloatArray) -> Pose:
-    """Return the pose of circles about a centre, with their unit normal, both in camera axes."""
+    """Return the pose of circles with a centre and a unit normal, both in the camera frame."""
     x = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
-    if np.linalg.norm(x) < 1e-6:  # seen from the side: any axis does
+    if np.linalg.norm(x) < 1e-6:  # seen from the side: any axis will do
         x = np.cross(normal, [0.0, 1.0, 0.0])
     x = x / np.linalg.norm(x)
     return Pose(np.column_stack((x, np.cross(normal, x), normal)), np.asarray(centre_m))
 
 
 def pose_of_ellipse(camera: Camera, ellipse: Ellipse, radius_m: float) -> Pose:
-    """Return one of the two poses that a circle has, whose image is an ellipse of raw pixels.
+    """Return one of the two poses of a circle whose image is a given ellipse [raw px].
 
-    A circle that is seen from the front is turned a little, so that an adjustment has a slope.
+    It is tilted a little more, so that an adjustment of a circle seen frontally has a gradient.
 
     Raises
     ------
     Rejection
-        If no circle before the camera has this image.
+        If no circle in front of the camera has this image.
     """
     outline = camera.undistort(ellipse.points(_TURN))
     plane = circle_planes(fit_ellipse(outline))[0]
@@ -95,7 +95,7 @@ def pose_of_ellipse(camera: Camera, ellipse: Ellipse, radius_m: float) -> Pose:
 
 
 def circles_about(pose: Pose, radii_m: FloatArray) -> Circles3D:
-    """Return concentric circles about a pose's origin."""
+    """Return concentric circles around the origin of a pose."""
     count = len(radii_m)
     return Circles3D(
         np.repeat(pose.translation_m[None], count, axis=0),
@@ -111,14 +111,14 @@ def fit_circles(
     prior: NormalPrior,
     rotation: SceneRotation | None = None,
 ) -> CirclesFit:
-    """Adjust a pose to the images of concentric circles, by Gauss and Newton.
+    """Adjust a pose to the images of concentric circles, by Gauss-Newton steps.
 
     `rotation` is that of the scene during the readout; None: `SceneRotation.unknown`.
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        If the circles leave the space before the camera, or the equations are singular.
+        If the circles get behind the camera, or the equations are singular.
     """
     images, cov_together = at_one_moment(camera, images, rotation)
     root: FloatArray = np.linalg.cholesky(cov_together).astype(np.float64)
@@ -145,7 +145,7 @@ def fit_circles(
 def _equations(
     camera: Camera, images: CircleMoments, root: FloatArray, pose: Pose, prior: NormalPrior
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return weighted residuals (5k + 2,), the design (5k + 2, 5) and axes of the two turns."""
+    """Return weighted residuals (5k + 2,), design matrix (5k + 2, 5) and axes of the two tilts."""
     circles = circles_about(pose, images.radii_m)
     slopes = circle_slopes(camera, circles)
     axes = pose.rotation[:, :2]
@@ -166,9 +166,9 @@ def at_one_moment(
 ) -> tuple[CircleMoments, FloatArray]:
     """Return images as if all rows had been exposed at once, and their covariance (5k, 5k).
 
-    While rows are exposed one after the other, the image moves by v per row: that shears it by
-    x + vₓ (y − y₀), y + v_y (y − y₀), and its second moments with it. It is the same v for all
-    circles. What is known of it is taken off, the rest is in the covariance.
+    While rows are exposed one after the other, the image moves by v per row. That shears it to
+    x + vₓ (y − y₀), y + v_y (y − y₀), and changes its second moments. All circles have the same v.
+    Its known part is taken off the moments; the unknown part is in the covariance.
     """
     count = len(images.moments)
     by_circle = np.zeros((count, 5, count, 5))

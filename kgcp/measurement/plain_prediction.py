@@ -13,39 +13,40 @@ from kgcp.measurement.plate_prior import NormalPrior, SceneRotation
 from kgcp.targets.plain import PlainTarget
 
 SIGMAS = 4.0
-"""How many standard deviations a target may be from its prediction."""
+"""How many standard deviations a target may be off its prediction."""
 SMALLEST_PX, SMALLEST_BARE_PX, SMALLEST_FREE_PX = 2.5, 3.0, 4.0
-"""Least radius of plain targets with even ground of their own, without, and with a free normal.
+"""Least radius of plain targets: on even ground of their own, without it, and with a free normal.
 
-Below, pebbles and clods are as round. On ground that is not known to be even, one disc of sixty was
-measured at a wrong place at 2.5 px. Where any ellipse would do, three or more of 2000 places
-without a target were taken for one between 2.5 and 4 px (`benchmarks.ground.plain_targets`).
+Below, pebbles and clods are as round (`benchmarks.ground.plain_targets`). On ground that is not
+known to be even, one disc in sixty was measured at a wrong place at 2.5 px. With a free normal, any
+ellipse is accepted: between 2.5 and 4 px, three or more of 2000 places without a target were taken
+for one.
 """
-_FARTHEST = 16.0  # largest uncertainty of the place, in radii: beyond, too much would be searched
-_FREE_SD_DEG = 60.0
+_FARTHEST = 16.0  # largest reach in radii that is searched
+_FREE_SD_DEG = 60.0  # prior of a free normal about the viewing ray
 _LEAST_COSINE = 0.17  # of the angle between normal and ray: 80°
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlainPrediction:
-    """The image of a plain target, as the frame's orientation and its position make it.
+    """The image of a plain target, predicted from its position and the frame's orientation.
 
     Attributes
     ----------
     centre_px : (2,) array
         Projected centre [px].
     cov_px2 : (2, 2) array
-        Of the centre [px²].
+        Covariance of the centre [px²].
     position_m : (3,) array
-        Of its centre in the camera frame [m].
+        Its centre in the camera frame [m].
     sd_log_distance : float
         Standard deviation of the logarithm of its distance.
     normal : NormalPrior or None
-        How its plane lies; None: not known.
+        Direction of its normal; None: not known.
     radius_px : float
-        Of its outer circle where it is widest [px].
+        Largest radius of its outer circle [px].
     source : str
-        What it was made from, in few words.
+        What it was made from, in a few words.
     rotation : SceneRotation or None
         How the scene turns during the readout; None: not known.
     """
@@ -69,10 +70,10 @@ class PlainPrediction:
 
     @property
     def prior(self) -> NormalPrior:
-        """How its plane lies, for an adjustment.
+        """The normal, for an adjustment.
 
-        Of a plane that may lie any way: roughly towards the camera, since it is seen. So weak a
-        prior only keeps equations regular where a circle is seen from the front.
+        A free normal is taken to be roughly along the viewing ray, since the target is seen. This
+        weak prior only keeps equations regular if a circle is seen frontally.
         """
         if self.normal is not None:
             return self.normal
@@ -80,7 +81,7 @@ class PlainPrediction:
 
     @property
     def sd_px(self) -> float:
-        """Standard deviation of the centre where it is worst [px]."""
+        """Largest standard deviation of the centre over all directions [px]."""
         return math.sqrt(float(np.linalg.eigvalsh(self.cov_px2)[-1]))
 
     @property

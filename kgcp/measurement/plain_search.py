@@ -1,4 +1,4 @@
-"""Edges that may be a plain target's, wherever its prediction allows."""
+"""The search for edges that may be a plain target's, within reach of its prediction."""
 
 from __future__ import annotations
 
@@ -11,23 +11,28 @@ from kgcp.geometry.conic import Ellipse
 from kgcp.measurement.discs.outlines import follow_outlines
 from kgcp.measurement.discs.records import DiscOutline, Polarity
 
-_SPACING = 0.4  # of the smaller semi-axis: how far the places are apart that edges are sought from
-_REACH, _LEAST_REACH_PX = 0.45, 2.0  # of the radius, how far from a guess
-_SAME_PLACE, _SAME_SIZE = 0.35, 1.15  # of the radius, and ratio of radii of one and the same edge
-_FEWEST_PX = 1.0  # of a semi-axis that is sought
+_SPACING = 0.4  # spacing of the start places, in smaller semi-axes
+_REACH, _LEAST_REACH_PX = (
+    0.45,
+    2.0,
+)  # how far from a start an edge may be: in radii, at least in pixels
+# Two outlines are of the same edge if their centres are nearer than this (in radii) and the ratio
+# of their radii is smaller than this.
+_SAME_PLACE, _SAME_SIZE = 0.35, 1.15
+_LEAST_SEMI_AXIS_PX = 1.0
 
 
 def edges_like(
     grey: GreyArray, expected: Ellipse, polarity: Polarity, reach_px: float
 ) -> list[DiscOutline]:
-    """Find the edges that look like an expected one, up to a distance from its place.
+    """Find edges that look like an expected one, up to a distance from its place.
 
     Parameters
     ----------
     expected : Ellipse
         In raw pixels.
     polarity : Polarity
-        Of what is within, against what is around.
+        Of the area within, against that around.
     reach_px : float
         How far the centre may be from the expected one.
 
@@ -36,7 +41,7 @@ def edges_like(
     list of DiscOutline
         Different edges, those of the expected size first.
     """
-    if expected.b < _FEWEST_PX:
+    if expected.b < _LEAST_SEMI_AXIS_PX:
         return []
     centres = _lattice(expected.centre, reach_px, _SPACING * expected.b)
     height, width = grey.shape
@@ -56,7 +61,7 @@ def edges_like(
 
 
 def _lattice(centre: FloatArray, reach_px: float, spacing_px: float) -> FloatArray:
-    """Return places (n, 2) within a distance, as evenly spaced as equilateral triangles."""
+    """Return places (n, 2) within a distance, at the corners of equilateral triangles."""
     rows = math.ceil(reach_px / (spacing_px * math.sqrt(0.75)))
     columns = math.ceil(reach_px / spacing_px) + 1
     row, column = np.mgrid[-rows : rows + 1, -columns : columns + 1]

@@ -93,7 +93,7 @@ class _Candidate:
     other: CirclesFit | None  # about the other normal
 
 
-def look_for_plain(
+def measure_plain(
     grey: GreyArray,
     camera: Camera,
     target: PlainTarget,

@@ -1,8 +1,8 @@
-"""What is known of a plate before it is measured: how it lies, how fast it goes by, its tone curve.
+"""What is known of a plate before it is measured: its normal, its motion, and the tone curve.
 
-The two poses of a circle have nearly the same image, and quite different normals. A plate that
-lies level, or on a vehicle of known attitude, in a camera whose attitude is known, makes one of
-them unlikely. And while a rolling shutter reads a plate, its image moves on.
+The two poses of a circle have nearly the same image, but quite different normals. If the camera's
+attitude is known, and the plate is level or on a vehicle of known attitude, one of the two is
+unlikely. The motion is needed because the image moves on while a rolling shutter reads it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.records import ToneBase
 
-_BELIEVED_CHI2 = 25.0  # 5 σ: beyond, what is known of the attitudes is wrong, and the image decides
+_BELIEVED_CHI2 = (
+    25.0  # 5 σ: if both normals are farther off, attitudes are wrong: the image decides
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,20 +30,20 @@ class NormalPrior:
 
     # (3,): unit vector in the camera frame, into the plate: downwards for a level plate
     direction_camera: FloatArray
-    sd_deg: float  # standard deviation of the normal about either axis square to it [deg]
+    sd_deg: float  # standard deviation of the normal about either axis perpendicular to it [deg]
 
     def chi2(self, pose: Pose, rotation_cov: FloatArray) -> float:
         """Return how far the normal of a measured pose is from the expected one, as χ² (2 dof).
 
-        dᵀ (S + sd² I)⁻¹ d, with the rotation d from one to the other and the covariance S of the
-        measured normal: the least χ² of both observations together. Without S, the noise of their
-        normals would decide about far targets.
+        It is dᵀ (S + sd² I)⁻¹ d, with the rotation d from one normal to the other and the
+        covariance S of the measured one: the least χ² of both observations together. Without S, the
+        noise of the normal would decide between the poses of far targets.
 
         Parameters
         ----------
         pose : Pose
         rotation_cov : (3, 3) array
-            Of its rotation vector in the camera frame [rad²].
+            Covariance of its rotation vector in the camera frame [rad²].
         """
         normal = pose.normal
         axis = np.cross(normal, self.direction_camera)
@@ -54,7 +56,7 @@ class NormalPrior:
     def preference(self, pose: Pose, other: Pose, rotation_cov: FloatArray) -> float:
         """Return the χ² of the other pose minus that of this one, each limited to 5 σ.
 
-        If both are farther off, neither is preferred: attitudes may be wrong.
+        If both are farther off, neither is preferred: attitudes are wrong.
         """
         own, others = (min(self.chi2(each, rotation_cov), _BELIEVED_CHI2) for each in (pose, other))
         return others - own
@@ -64,11 +66,11 @@ class NormalPrior:
 class SceneRotation:
     """How the scene turns about the camera while a rolling shutter reads it."""
 
-    # Ω about the camera's axes x right, y down, z forward: a point X moves by Ω × X. It combines
-    # the inverse of the camera's own rotation with the rotation of the line of sight to a moving
-    # plate, or from a moving camera.
+    # Ω about the camera's axes x right, y down, z forward: a point X moves with the velocity Ω × X.
+    # It combines the inverse of the camera's own rotation with the rotation of the line of sight to
+    # a moving plate, or from a moving camera.
     velocity_rad_s: tuple[float, float, float]
-    sd_rad_s: float  # standard deviation of each of the three
+    sd_rad_s: float  # standard deviation of each component
 
     @classmethod
     def unknown(cls, camera: Camera) -> Self:
@@ -80,9 +82,9 @@ class SceneRotation:
 class PlatePrior:
     """What is known of one target in one frame before it is measured."""
 
-    # where its normal points; it helps to choose between the two poses
+    # its normal, which helps to choose between the two poses
     normal: NormalPrior | None = None
-    # None: nothing more than what `SceneRotation.unknown` says
+    # None: `SceneRotation.unknown`
     rotation: SceneRotation | None = None
-    # what an unknown tone curve departs from, if other frames have told it
+    # base of an unknown tone curve, if other frames have shown it
     tone_base: ToneBase | None = None

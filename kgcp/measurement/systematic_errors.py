@@ -1,7 +1,7 @@
 """Errors that all frames share: the camera's calibration and the size of the print.
 
-Averaging over frames does not reduce them. They are therefore not part of an observation's own
-covariance, and are reported separately.
+Averaging over frames does not reduce them. So they are not part of a measurement's own covariance,
+and are reported separately.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ def common_uncertainty(
 ) -> CommonUncertainty | None:
     """Propagate calibration and diameter to a measured pose, to first order.
 
-    The image stays as it is; the pose moves so that the ring's outer circle still covers it, in
-    the sense of least squares. All lengths of a print are wrong by the same factor, which moves the
-    target along its ray.
+    The image is given. If the calibration changes, the pose moves so that the ring's outer circle
+    still fits it by least squares. An error of the diameter is one of all lengths of the print, and
+    moves the target along its ray.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def common_uncertainty(
 
 
 def pose_by_calibration(camera: Camera, radius_m: float, pose: Pose) -> FloatArray:
-    """Return how a pose follows the calibration if the image of a circle on the plate stays.
+    """Return the derivatives of a pose by the calibration, for a given image of the ring's circle.
 
     Returns
     -------
@@ -82,7 +82,7 @@ def pose_by_calibration(camera: Camera, radius_m: float, pose: Pose) -> FloatArr
     along_circle = np.stack((-sine, cosine), axis=-1) @ pose.rotation[:, :2].T
     weigh = _edge_weights((by_point @ along_circle[:, :, None])[:, :, 0])
     by_calibration = weigh @ image_by_calibration(camera, normalised)
-    # Metres and radians: the first three columns are scaled to be comparable with the others.
+    # the columns of the translation are scaled, to be comparable with those of the rotation
     scale = np.array([*(pose.distance_m,) * 3, 1.0, 1.0, 1.0])
     design = (weigh @ by_pose).reshape(-1, 6) * scale
     moved = np.linalg.lstsq(design, by_calibration.reshape(2 * _POINTS, -1), rcond=None)[0]
@@ -91,10 +91,10 @@ def pose_by_calibration(camera: Camera, radius_m: float, pose: Pose) -> FloatArr
 
 
 def _edge_weights(along: FloatArray) -> FloatArray:
-    """Return the matrices (n, 2, 2) from displacements of an edge [px] to weighted residuals.
+    """Return the matrices (n, 2, 2) that make weighted residuals of displacements of an edge [px].
 
-    An edge only shows how far it is displaced across its direction `along` (n, 2). Along it the
-    dots give a little information, which determines the heading and hardly counts elsewhere.
+    An edge shows how far it is displaced across its direction `along` (n, 2). The dots give a
+    little information along it, too, which determines the heading and hardly counts otherwise.
     """
     x, y = (along / np.linalg.norm(along, axis=1, keepdims=True)).T
     rows = np.stack((-y, x), -1), _ALONG_EDGE * np.stack((x, y), -1)

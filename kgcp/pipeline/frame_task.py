@@ -18,9 +18,9 @@ from kgcp.io.images.exif import Exif, read_exif
 from kgcp.io.images.frames import read_grey
 from kgcp.io.images.remote import StoredFolder, at_hand
 from kgcp.measurement.frame import examine, miss_of
-from kgcp.measurement.guided import Prediction, look_again
+from kgcp.measurement.guided import Prediction, measure_guided
 from kgcp.measurement.plain_prediction import PlainPrediction
-from kgcp.measurement.plain_target import look_for_plain
+from kgcp.measurement.plain_target import measure_plain
 from kgcp.measurement.plate_prior import PlatePrior
 from kgcp.measurement.records import (
     Considered,
@@ -119,7 +119,7 @@ def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
         examination = examine(grey, job.camera, job.targets, job.settings, job.priors(frame_input))
         measured = [each for each in examination.outcomes if isinstance(each, Measurement)]
         plain = [
-            look_for_plain(
+            measure_plain(
                 grey,
                 job.camera,
                 target,
@@ -171,7 +171,7 @@ def examine_frame_again(job: DetectionJob, guided_input: GuidedInput) -> FrameRe
     considered: list[Considered] = []
     for target in job.targets:
         if target.name in guided_input.predictions:
-            measurement, compared = look_again(
+            measurement, compared = measure_guided(
                 grey,
                 job.camera,
                 target,
@@ -263,7 +263,7 @@ def _outcomes_of_second_look(
     for target in job.plain_targets:
         prediction = _predicted(guided_input.input, guided_input.plain, target)
         if prediction is not None:
-            outcome = look_for_plain(grey, job.camera, target, prediction, measured)
+            outcome = measure_plain(grey, job.camera, target, prediction, measured)
             if isinstance(outcome, Measurement):
                 (outcome,) = completed(job, [replace(outcome, is_guided=True)])
             plain[target.name] = outcome

@@ -11,7 +11,7 @@ from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.guided import Prediction, look_again
+from kgcp.measurement.guided import Prediction, measure_guided
 from kgcp.measurement.plate_prior import PlatePrior
 from kgcp.measurement.records import Measurement, Miss
 from kgcp.pipeline.measure import measure_frame
@@ -33,7 +33,7 @@ def expected_at(
 def look(
     grey: GreyArray, camera: Camera, target: Target, prediction: Prediction
 ) -> Measurement | None:
-    return look_again(grey, camera, target, prediction, SETTINGS, PlatePrior(), ())[0]
+    return measure_guided(grey, camera, target, prediction, SETTINGS, PlatePrior(), ())[0]
 
 
 @pytest.mark.parametrize(
@@ -159,7 +159,10 @@ def test_another_target_s_plate_is_not_looked_at(
     (rival,) = measure_frame(grey, camera, (target,), SETTINGS)
     assert isinstance(rival, Measurement)
     wanted = expected_at(200.0, 150.0, 12.0)
-    assert look_again(grey, camera, target, wanted, SETTINGS, PlatePrior(), (rival,)) == (None, ())
+    assert measure_guided(grey, camera, target, wanted, SETTINGS, PlatePrior(), (rival,)) == (
+        None,
+        (),
+    )
 
 
 def test_what_was_considered_says_why_it_was_dropped(
@@ -168,7 +171,7 @@ def test_what_was_considered_says_why_it_was_dropped(
     decoy = Target(Ring("B", 0.9, 0.45, 0.642857143, 0.128571429, OTHER_CODES[0]))
     grey = draw_frame((decoy, place_plate((200.0, 150.0), 12.0)))
     wanted = expected_at(200.0, 150.0, 12.0)
-    seen, considered = look_again(grey, camera, target, wanted, SETTINGS, PlatePrior(), ())
+    seen, considered = measure_guided(grey, camera, target, wanted, SETTINGS, PlatePrior(), ())
     assert seen is None
     assert considered[0].reason is Reason.OTHER_CODE
 

@@ -24,7 +24,7 @@ from kgcp.measurement.plain_pose import (
     pose_towards,
 )
 from kgcp.measurement.plain_prediction import PlainPrediction
-from kgcp.measurement.plain_target import look_for_plain
+from kgcp.measurement.plain_target import measure_plain
 from kgcp.measurement.plate_prior import NormalPrior, SceneRotation
 from kgcp.measurement.records import Measurement, Miss, Outcome
 from kgcp.simulation.imaging import Optics, Sensor
@@ -71,7 +71,7 @@ def prediction_of(
 def looked(
     grey: GreyArray, prediction: PlainPrediction | None, target: PlainTarget = DISC
 ) -> Outcome:
-    return look_for_plain(grey, CAMERA, target, prediction)
+    return measure_plain(grey, CAMERA, target, prediction)
 
 
 @pytest.mark.parametrize("target", [DISC, RING], ids=["disc", "ring"])
@@ -150,7 +150,7 @@ def test_an_unknown_tone_curve_leaves_the_size_of_a_far_ring(
     grey = np.rint(255.0 * srgb_encoded(light.ravel()).reshape(light.shape)).astype(np.uint8)
     expected = replace(prediction_of(pose, (5.0, -4.0)), radius_px=radius_px)
     camera = replace(CAMERA, response=Response.UNKNOWN)
-    outcome = look_for_plain(grey, camera, target, expected)
+    outcome = measure_plain(grey, camera, target, expected)
     assert isinstance(outcome, Measurement)
     assert outcome.uncertainty is not None
     sd = outcome.uncertainty.sd_distance_m / pose.distance_m
@@ -426,8 +426,8 @@ def test_motion_that_is_known_is_taken_off() -> None:
 def test_a_rolling_shutter_widens_what_is_reported() -> None:
     pose = pose_at(90.4, 71.7)
     grey, prediction = frame_with((DISC, pose)), prediction_of(pose)
-    still = look_for_plain(grey, CAMERA, DISC, prediction)
-    rolling = look_for_plain(grey, ROLLING, DISC, prediction)
+    still = measure_plain(grey, CAMERA, DISC, prediction)
+    rolling = measure_plain(grey, ROLLING, DISC, prediction)
     assert isinstance(still, Measurement)
     assert isinstance(rolling, Measurement)
     assert still.uncertainty is not None

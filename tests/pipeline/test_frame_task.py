@@ -162,7 +162,7 @@ def test_what_is_known_of_motion_goes_with_a_plain_target_s_prediction(
         seen.append(prediction.rotation)
         return Miss("W", Reason.NO_PREDICTION)
 
-    monkeypatch.setattr("kgcp.pipeline.frame_task.look_for_plain", look)
+    monkeypatch.setattr("kgcp.pipeline.frame_task.measure_plain", look)
     rotation = SceneRotation((0.1, 0.0, 0.0), 0.01)
     plain = PlainTarget("W", (0.4,), PlainPolarity.BRIGHT, (0.0, 0.0, 0.0), border_m=0.4)
     where = PlainPrediction(

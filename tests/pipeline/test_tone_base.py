@@ -216,7 +216,7 @@ def test_a_second_look_is_over_the_same_base(flight: Path, monkeypatch: pytest.M
         asked.append(arguments[5])
         return None, ()
 
-    monkeypatch.setattr("kgcp.pipeline.frame_task.look_again", look)
+    monkeypatch.setattr("kgcp.pipeline.frame_task.measure_guided", look)
     folder = read_flight(flight).frames_folder
     job = DetectionJob(folder, CAMERA, None, (target,), DetectSettings(), tone_base=ToneBase.LINE)
     known = FrameInput("f_00.png", None, {})

@@ -8,7 +8,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
-from kgcp.measurement.guided import Prediction, look_again
+from kgcp.measurement.guided import Prediction, measure_guided
 from kgcp.measurement.plate_prior import PlatePrior
 from kgcp.measurement.records import Measurement
 from kgcp.settings import DetectSettings
@@ -56,7 +56,7 @@ def measure_again(
 
     def measured(gain: float) -> Measurement | None:
         changed = _reexposed_around(grey, gain, centre_px, radius_px)
-        return look_again(changed, camera, target, prediction, settings, PlatePrior(), ())[0]
+        return measure_guided(changed, camera, target, prediction, settings, PlatePrior(), ())[0]
 
     before = measured(1.0)
     if before is None:
