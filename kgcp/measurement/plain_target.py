@@ -1,7 +1,7 @@
-"""A plain disc or ring, measured where a frame must show it, if nothing else there can be it.
+"""The measurement of a plain disc or ring, where the frame must show it.
 
-Its edge alone tells it from what is round as well: so place, size, shape, polarity and grey values
-must all agree with the prediction, and no second edge may do so.
+A plain target has no code, and other things are round, too. So place, size, shape, polarity and
+grey values of its edge must all agree with the prediction, and no second edge may do so.
 """
 
 from __future__ import annotations
@@ -56,17 +56,18 @@ from kgcp.targets.plain import PlainTarget
 
 # Tuning; `benchmarks.ground.plain_targets` counts what is found and what is taken for a target.
 _MOST_TRIES = 24  # edges that are measured per target
-# The variances on ground that is not known to be even, where they are not made from its texture: it
-# displaces edges over longer stretches than the arcs that the covariance is made from.
-_BARE = 3.5
-_SHAPE_PX, _SHAPE = 1.0, 0.2  # how far an edge's semi-axes may be from the expected ones
-# of a normal that is free: least ratio of an edge's axes; what is sought, of the largest image
+# Factor of the variances on ground that is not known to be even, unless they allow for its texture.
+# Texture displaces edges over longer stretches than the arcs that the covariance is estimated from.
+_BARE_GROUND_FACTOR = 3.5
+_SHAPE_PX, _SHAPE = 1.0, 0.2  # largest error of an edge's semi-axes: in pixels, and relative
+# With a free normal: least ratio of an edge's axes, and scale of the ellipse that edges are
+# searched from, relative to the circle seen frontally
 _FREE_RATIO, _FREE_SCALE = 0.5, 0.8
-_SAME_NORMAL = 1.0 - 1e-8  # cosine between two solutions that are one
-_INNER_REACH, _LEAST_INNER_REACH_PX = 0.08, 1.2  # of the outer radius, of inner circles
-# Edges nearer to each other than this leave each other too few pixels, and are measured as one. On
-# larger rings errors of the print are larger than those of the edges, and circles apart tell the
-# normal: each is measured by itself.
+_SAME_NORMAL = 1.0 - 1e-8  # least cosine between the normals of two solutions that are one
+_INNER_REACH, _LEAST_INNER_REACH_PX = 0.08, 1.2  # how far inner circles may be off, in outer radii
+# Circles nearer to each other than this leave each other too few pixels: the ring is measured as a
+# whole. On rings above the second radius, each circle is measured by itself: errors of the print
+# are larger than those of the edges there, and circles that are measured apart tell the normal.
 _NARROW_PX, _LARGE_PX = 4.0, 30.0
 _REASONS = {
     DiscReason.CUT: Reason.CUT,
@@ -90,7 +91,7 @@ class _Candidate:
 
     circles: _Circles
     fit: CirclesFit
-    other: CirclesFit | None  # about the other normal
+    other: CirclesFit | None  # with the other normal
 
 
 def measure_plain(
@@ -109,20 +110,20 @@ def measure_plain(
     prediction : PlainPrediction or None
         Where it must be; None: the frame's orientation is not known.
     measured : sequence of Measurement
-        Coded targets of this frame: what lies on them is something else.
+        Coded targets of this frame, whose edges are not the plain target's.
     """
     if prediction is None:
         return Miss(target.name, Reason.NO_PREDICTION)
     try:
         _check_prediction(camera, target, prediction)
         expected = _expected_ellipse(camera, target, prediction)
-        # a plane that may lie any way: between the extremes, within reach of both
+        # with a free normal, edges are searched from a size between the extremes
         sought = expected if prediction.normal is not None else expected.scaled(_FREE_SCALE)
         edges = edges_like(grey, sought, _polarity(target), prediction.reach_px)
-        free = [each for each in edges if not any(one.covers(each.ellipse) for one in measured)]
+        free = [edge for edge in edges if not any(coded.covers(edge.ellipse) for coded in measured)]
         edges = _alike(free, expected, prediction)
         candidate = _only_candidate(grey, camera, target, prediction, edges)
-        candidate = _on_texture(grey, camera, target, prediction, candidate)
+        candidate = _measured_on_texture(grey, camera, target, prediction, candidate)
     except Rejection as rejection:
         return Miss(target.name, rejection.reason, rejection.detail)
     return _measurement(camera, target, prediction, candidate)
@@ -152,15 +153,15 @@ def _only_candidate(
     Raises
     ------
     Rejection
-        If there is none, or another one.
+        If there is none, or more than one.
     """
     accepted: list[_Candidate] = []
-    first: tuple[Reason, str] | None = None
+    first_refusal: tuple[Reason, str] | None = None
     for edge in edges[:_MOST_TRIES]:
         try:
             accepted.append(_try_edge(grey, camera, target, prediction, edge))
         except Rejection as rejection:
-            first = first or (rejection.reason, rejection.detail)
+            first_refusal = first_refusal or (rejection.reason, rejection.detail)
     if accepted and len(edges) > _MOST_TRIES:
         raise Rejection(
             Reason.AMBIGUOUS_PLACE, f"{len(edges)} edges of its size and shape; {prediction}"
@@ -172,8 +173,8 @@ def _only_candidate(
         raise Rejection(Reason.AMBIGUOUS_PLACE, f"alike at {places}; {prediction}")
     if accepted:
         return accepted[0]
-    if first is not None:
-        reason, detail = first
+    if first_refusal is not None:
+        reason, detail = first_refusal
         raise Rejection(reason, f"{detail}; {prediction}")
     raise Rejection(Reason.NO_CANDIDATE, str(prediction))
 
@@ -185,7 +186,7 @@ def _try_edge(
     prediction: PlainPrediction,
     edge: DiscOutline,
 ) -> _Candidate:
-    """Measure a target from the edge of its outer circle, and check everything."""
+    """Measure a target from the edge of its outer circle, and check that it is the target."""
     start = _start(camera, target, prediction, edge.ellipse)
     circles = _measured_circles(grey, camera, target, prediction, start, edge)
     check_edge(circles.discs[0])
@@ -211,23 +212,23 @@ def _checked(
     return _Candidate(circles, fit, other)
 
 
-def _on_texture(
+def _measured_on_texture(
     grey: GreyArray,
     camera: Camera,
     target: PlainTarget,
     prediction: PlainPrediction,
     candidate: _Candidate,
 ) -> _Candidate:
-    """Measure the outer edge of a target without a border by the texture of the ground around it.
+    """Measure the outer edge again with the ground's texture, if the target has no border.
 
-    Only of the accepted one: what other edges have around them is no ground. Rings that are
-    measured as a whole, or of which a circle is missing, stay as they are; so do burnt discs, and
-    those on burnt ground.
+    This is done for the accepted candidate only: around other edges there may be no ground. Not
+    measured again are rings that were measured as a whole or lack a circle, burnt discs, and discs
+    on burnt ground.
 
     Raises
     ------
     Rejection
-        If it no longer agrees with the prediction.
+        If the target no longer agrees with the prediction.
     """
     discs, images = candidate.circles.discs, candidate.circles.images
     if target.border_m is not None or len(discs) < len(target.radii_m):
@@ -254,12 +255,12 @@ def _on_texture(
 def _alike(
     edges: Sequence[DiscOutline], expected: Ellipse, prediction: PlainPrediction
 ) -> list[DiscOutline]:
-    """Return the edges that are like the expected one in both axes, before they are measured.
+    """Return the edges whose axes are like the expected ones, before any is measured.
 
     Raises
     ------
     Rejection
-        If there are edges, and none is.
+        If there are edges, but none is like the expected one.
     """
     tolerance_px = math.hypot(_SHAPE_PX, _SHAPE * expected.a)
     least_b = expected.b if prediction.normal is not None else _FREE_RATIO * expected.b
@@ -277,7 +278,7 @@ def _alike(
 
 
 def _polarity(target: PlainTarget, circle: int = 0) -> Polarity:
-    """Return the polarity of what is within a circle against what is directly around it."""
+    """Return the polarity of the area within a circle, against that directly around it."""
     outer = Polarity(target.polarity.value)
     return outer if circle % 2 == 0 else outer.other
 
@@ -290,7 +291,7 @@ def _ellipses_of(camera: Camera, target: PlainTarget, pose: Pose) -> list[Ellips
 
 
 def _expected_ellipse(camera: Camera, target: PlainTarget, prediction: PlainPrediction) -> Ellipse:
-    """Return the outer circle's image; of a plane that may lie any way, as seen from the front."""
+    """Return the image of the outer circle; with a free normal, as seen frontally."""
     pose = pose_towards(prediction.position_m, prediction.prior.direction_camera)
     return _ellipses_of(camera, target, pose)[0]
 
@@ -298,7 +299,7 @@ def _expected_ellipse(camera: Camera, target: PlainTarget, prediction: PlainPred
 def _start(
     camera: Camera, target: PlainTarget, prediction: PlainPrediction, ellipse: Ellipse
 ) -> Pose:
-    """Return the pose that an outline of the outer circle has, if its plane is as expected."""
+    """Return the pose of a target whose outer circle has this outline, with the expected normal."""
     if prediction.normal is None:
         return pose_of_ellipse(camera, ellipse, target.radii_m[0])
     x, y = camera.undistort(ellipse.centre[None])[0].tolist()
@@ -322,11 +323,11 @@ def _measured_circles(
     """Measure the outer circle and those within it."""
     ellipses = _ellipses_of(camera, target, start)
     if _is_narrow(ellipses):
-        whole = _measured_whole(grey, camera, target, start, edge)
+        whole = _measured_as_whole(grey, camera, target, start, edge)
         if prediction.normal is not None:
             return whole
         mirrored = start.mirrored()
-        return _between(whole, _measured_whole(grey, camera, target, mirrored, edge))
+        return _mean_of(whole, _measured_as_whole(grey, camera, target, mirrored, edge))
     outlines = [edge]
     inner = [
         DiscOutline.predicted(ellipse, _polarity(target, circle))
@@ -347,14 +348,14 @@ def _measured_circles(
         )
         if isinstance(outcome, DiscMiss):
             if discs and outcome.reason is DiscReason.CROWDED:
-                continue  # its edge is there, and the outer circle says more
+                continue  # its edge is there; the outer circle is enough
             raise Rejection(_REASONS[outcome.reason], outcome.detail)
         discs.append(outcome)
         radii_m.append(radius_m)
     images = CircleMoments(
         np.array(radii_m),
         np.array([disc.vector for disc in discs]),
-        np.array([disc.cov for disc in discs]) * (1.0 if border else _BARE),
+        np.array([disc.cov for disc in discs]) * (1.0 if border else _BARE_GROUND_FACTOR),
     )
     return _Circles(tuple(discs), images)
 
@@ -365,14 +366,14 @@ def _is_narrow(ellipses: Sequence[Ellipse]) -> bool:
     return is_near and ellipses[0].a < _LARGE_PX
 
 
-def _measured_whole(
+def _measured_as_whole(
     grey: GreyArray,
     camera: Camera,
     target: PlainTarget,
     start: Pose,
     edge: DiscOutline,
 ) -> _Circles:
-    """Measure the outer circle of a ring whose others move and grow with it."""
+    """Measure a ring as a whole: the outer circle, with which the others move and grow."""
     ellipses = _ellipses_of(camera, target, start)
     to_unit = np.linalg.inv(ellipses[0].stretch)
     inner = [
@@ -388,15 +389,15 @@ def _measured_whole(
     )
     if isinstance(outcome, DiscMiss):
         raise Rejection(_REASONS[outcome.reason], outcome.detail)
-    cov = outcome.cov * (1.0 if border else _BARE)
+    cov = outcome.cov * (1.0 if border else _BARE_GROUND_FACTOR)
     images = CircleMoments(np.array(target.radii_m[:1]), outcome.vector[None], cov[None])
     return _Circles((outcome,), images)
 
 
-def _between(first: _Circles, second: _Circles) -> _Circles:
-    """Return the mean of two measurements by two normals, of which either may be the right one.
+def _mean_of(first: _Circles, second: _Circles) -> _Circles:
+    """Return the mean of two measurements with two normals, of which either may be right.
 
-    The inner circles' places follow from the normal, and with them those of the outer one.
+    The normal determines where the inner circles are, and so affects the outer one.
     """
     apart = second.images.moments - first.images.moments
     both = CircleMoments(
@@ -409,7 +410,7 @@ def _between(first: _Circles, second: _Circles) -> _Circles:
 
 
 def _border(camera: Camera, target: PlainTarget, pose: Pose) -> list[DiscOutline]:
-    """Return where the even ground ends, as an edge that pixels keep clear of."""
+    """Return the outline where the even ground ends, which pixels are kept clear of."""
     if target.border_m is None:
         return []
     radius_m = target.radii_m[0] + target.border_m
@@ -422,7 +423,7 @@ def _border(camera: Camera, target: PlainTarget, pose: Pose) -> list[DiscOutline
 def _best_fits(
     camera: Camera, images: CircleMoments, start: Pose, prediction: PlainPrediction
 ) -> tuple[CirclesFit, CirclesFit | None]:
-    """Return the better of both normals' fits, and the other one if it is another."""
+    """Return the better fit of both normals, and the other one; None: they are the same."""
     fits = [fit_circles(camera, images, start, prediction.prior, prediction.rotation)]
     mirrored = fits[0].pose.mirrored()
     begin = pose_towards(mirrored.translation_m, mirrored.normal)
@@ -439,7 +440,7 @@ def _best_fits(
 def _measurement(
     camera: Camera, target: PlainTarget, prediction: PlainPrediction, candidate: _Candidate
 ) -> Measurement:
-    pose, pose_cov, alternative = _over_both(candidate.fit, candidate.other)
+    pose, pose_cov, alternative = _mean_over_normals(candidate.fit, candidate.other)
     images, _ = at_one_moment(camera, candidate.circles.images, prediction.rotation)
     return Measurement(
         target=target.name,
@@ -456,22 +457,22 @@ def _measurement(
     )
 
 
-def _over_both(
+def _mean_over_normals(
     fit: CirclesFit, other: CirclesFit | None
 ) -> tuple[Pose, FloatArray, Alternative | None]:
-    """Return pose, covariance and the other pose, where either normal may be the right one.
+    """Return pose, covariance and the other pose, as either normal may be the right one.
 
-    Between the two the centre is where its mean square error is least, at their mean, weighted by
-    their probabilities p and q: the difference d of the two adds p q d dᵀ.
+    The centre is the mean of both, weighted by their probabilities p and q: its mean square error
+    is least there. The difference d of the two adds p q d dᵀ to the covariance.
     """
     if other is None:
         return fit.pose, fit.pose_cov, None
     ambiguity = other.chi2 - fit.chi2
-    share = float(expit(-0.5 * ambiguity))
+    probability = float(expit(-0.5 * ambiguity))
     apart_m = other.pose.translation_m - fit.pose.translation_m
     pose_cov = fit.pose_cov.copy()
-    pose_cov[:3, :3] += share * (1.0 - share) * np.outer(apart_m, apart_m)
-    pose = Pose(fit.pose.rotation, fit.pose.translation_m + share * apart_m)
+    pose_cov[:3, :3] += probability * (1.0 - probability) * np.outer(apart_m, apart_m)
+    pose = Pose(fit.pose.rotation, fit.pose.translation_m + probability * apart_m)
     return pose, pose_cov, Alternative(other.pose, ambiguity)
 
 

@@ -1,4 +1,4 @@
-"""What one frame says about one target: the records that leave the measurement."""
+"""The records of a measurement: what one frame shows of its targets."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ class Appearance:
     saturated : float
         Share of clipped pixels within the outer ellipse, 0…1.
     edge_shift_px : float or None
-        δ: displacement of the edges towards the dark side, from both circles [px].
+        δ: displacement of the edges towards the dark side, from both circles [px]; None where the
+        method does not estimate it.
     blur_px : float or None
         Edge spread σ [px]; None where the method does not estimate it.
     """
@@ -41,7 +42,7 @@ class Appearance:
 
 
 class ToneBase(StrEnum):
-    """The curve that a fitted tone curve departs from."""
+    """The known curve that a fitted tone curve is a modification of."""
 
     SRGB = "sRGB"
     LINE = "a straight line"
@@ -49,16 +50,16 @@ class ToneBase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Imaging:
-    """What the fit of one target says of the camera. Grey values are 0…1 of their range.
+    """What the fit of one target shows of the camera. Grey values are 0…1 of their range.
 
     Attributes
     ----------
     base : ToneBase
-        What the tone curve is near to.
+        The known curve that the tone curve is near to.
     black, white : float
-        Light of ink and plate, as grey values that the base would give.
+        Light of ink and plate, as the grey values that the base would give them.
     tone : tuple of float
-        Three numbers that shape the curve between them; as in `photometry.Light`.
+        Three shape parameters of the curve between ink and plate, as in `photometry.Light`.
     sharpening : float
         Strength of the unsharp mask.
     noise_black, noise_white : float
@@ -100,7 +101,7 @@ class Uncertainty:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CommonUncertainty:
-    """What is wrong in all frames alike: camera calibration and diameter; not in `Uncertainty`.
+    """Errors that all frames share, by camera calibration and diameter; not in `Uncertainty`.
 
     Attributes
     ----------
@@ -109,7 +110,7 @@ class CommonUncertainty:
     sd_distance_m : float
         Of the distance [m].
     sd_direction_mrad : float
-        Of the direction to the target's centre in the camera frame, where it is worst [mrad].
+        Largest one of the direction to the target's centre in the camera frame [mrad].
     """
 
     pose_cov: FloatArray
@@ -124,13 +125,13 @@ class Alternative:
     Attributes
     ----------
     pose : Pose
-        Same distance (nearly), normal mirrored about the viewing ray.
+        It has nearly the same distance; its normal is mirrored about the viewing ray.
     ambiguity : float
-        How much worse it fits; 0: cannot be told apart. By the image model: Δχ² of the image,
-        deflated by the correlation of its residuals, and of the prior; by the paper's chain:
-        misfit of the inner ellipse's centre [px].
+        How much worse it fits; 0: it fits as well. With the image model: Δχ² of the image, divided
+        by the inflation of the covariance, plus that of the prior. With the paper's chain: misfit
+        of the inner ellipse's centre [px].
     pose_cov : (6, 6) array or None
-        As in `Uncertainty`, if it were the right pose; None where the image is sure that it is not.
+        As in `Uncertainty`, if this were the right pose; None if the image clearly excludes it.
     """
 
     pose: Pose
@@ -140,16 +141,16 @@ class Alternative:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContourSmoothing:
-    """What smoothing along contours, beyond the blur across them, does to a measurement.
+    """Effect on a measurement of smoothing along contours beyond the blur across them.
 
     Attributes
     ----------
     seen_px2, sd_seen_px2 : float
-        Its variance and standard deviation as this image alone shows them [px²].
+        The smoothing, as a variance, that this image alone shows, and its standard deviation [px²].
     pose_by_smoothing : (6,) array
-        Derivative of the pose, as `Uncertainty.pose_cov` has it [m/px², rad/px²].
+        Derivative of the pose, in the order of `Uncertainty.pose_cov` [m/px², rad/px²].
     taken_px2, sd_taken_px2 : float
-        What the measurement takes it for, which is in its pose and covariance [px²].
+        The smoothing, and its standard deviation, that pose and covariance are corrected for [px²].
     """
 
     seen_px2: float
@@ -161,7 +162,7 @@ class ContourSmoothing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InitialPose:
-    """What the adjustment starts from: the outline that the search has followed, as a pose."""
+    """The start of the adjustment: a pose, from the outline that the search has followed."""
 
     ring: str  # name of the ring, the target's own or a replica
     score: float  # normalised cross-correlation of the code
@@ -197,19 +198,19 @@ class Measurement:
     common : CommonUncertainty or None
         None where nothing is known about calibration and diameter.
     is_guided : bool
-        Whether it was found only where other frames or the reference poses said it must be.
+        Whether it was found only with a prediction from other frames or the reference poses.
     imaging : Imaging or None
         None where the method fits no tone.
     rival : RivalTone or None
-        The same by the other base of an unknown tone; None where that was not asked for, or leads
-        nowhere.
+        The measurement over the other base of an unknown tone; None if that was not tried, or
+        failed.
     smoothing : ContourSmoothing or None
-        None where none is expected: of cameras with a known tone, and in bins.
+        None where none is expected: with a known tone, and in bins.
     eccentricity_px : (2,) array or None
-        Centroid of the image of the main ring's outer circle minus `centre_px`: what other
-        programs measure is off by this. None where it was not asked for.
+        Centroid of the image of the main ring's outer circle minus `centre_px`: the error of
+        programs that measure the centroid. None where it was not asked for.
     image : CircleImage or None
-        What was measured of a plain target, before its pose was made from it; None of coded rings.
+        Image of a plain target's outer circle, which its pose was made from; None for coded rings.
     """
 
     target: str
@@ -250,15 +251,15 @@ class Measurement:
 class CircleImage:
     """The image of one circle: its centroid [px] and second moments [px²].
 
-    Nothing that is known of target or frame beforehand has a part in it, but for motion under a
-    rolling shutter: the image is that of one moment.
+    No prior of target or frame has a part in it, except the motion under a rolling shutter: it is
+    the image of one moment.
 
     Attributes
     ----------
     moments : (5,) array
         As `discs.records.MOMENTS`.
     cov : (5, 5) array
-        With what is not known of that motion.
+        Covariance of the moments, with the unknown part of that motion.
     """
 
     moments: FloatArray
@@ -272,7 +273,7 @@ class RivalTone:
     Attributes
     ----------
     advantage : float
-        Log-likelihood by which it is the less likely one.
+        Log-likelihood by which it is less likely.
     """
 
     measurement: Measurement
@@ -296,7 +297,8 @@ class Miss:
     score : float or None
         Normalised cross-correlation of the best candidate, if there was one.
     candidates : int
-        Rings that were compared with the target's, but for those of other measured targets.
+        Number of rings that were compared with the target's, without those of other measured
+        targets.
     outline : Ellipse or None
         Outer edge of the best candidate, if there was one [px].
     """
@@ -314,7 +316,7 @@ Outcome = Measurement | Miss
 
 @dataclass(frozen=True, slots=True)
 class ExposureSettings:
-    """How the camera exposed a frame; None where it does not say.
+    """How the camera exposed a frame; None where the file does not say.
 
     Attributes
     ----------
@@ -341,7 +343,7 @@ class TimeSource(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class FrameResult:
-    """All that was learned from one frame.
+    """All results of one frame.
 
     Attributes
     ----------
@@ -352,11 +354,11 @@ class FrameResult:
     outcomes : tuple of Outcome
         At least one per target, in the targets' order.
     camera_time_s : float or None
-        When the camera itself says it took the frame, Unix UTC [s].
+        Time of the frame by the camera's clock, Unix UTC [s].
     dropped : tuple of Considered
         Rings that were compared with a target's and dropped, if they are to be shown.
     time_source : TimeSource
-        Who said so.
+        Where `time_s` is from.
     """
 
     frame: str
@@ -386,7 +388,7 @@ class Considered:
     score : float
         Normalised cross-correlation.
     is_match : bool
-        Whether the code was there, so that it was worth measuring.
+        Whether it carries the code, and was to be measured.
     reason : Reason or None
         Why it was dropped; None: it was measured.
     detail : str
