@@ -45,8 +45,8 @@ def enclosed_discs(grey: GreyArray, count: int, response: Response) -> list[list
         mine = [i for i, each in enumerate(discs) if each.polarity is polarity]
         if len(mine) >= count:
             groups |= _groups(grey, [discs[i] for i in mine], mine, count)
-    found = [[discs[i] for i in group] for group in sorted(groups)]
-    return sorted(found, key=lambda group: (group[0].y, group[0].x))
+    discs_by_group = [[discs[i] for i in group] for group in sorted(groups)]
+    return sorted(discs_by_group, key=lambda group: (group[0].y, group[0].x))
 
 
 def _groups(

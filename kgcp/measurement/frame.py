@@ -177,14 +177,14 @@ def measure_match(
         With the reason of the first test that fails.
     """
     if settings.method is Method.PAPER:
-        observation = measure_ring(grey, camera, target, match)
-        _check_plate(grey, camera, target, match.ring, observation.pose, settings)
-        return observation
+        measurement = measure_ring(grey, camera, target, match)
+        _check_plate(grey, camera, target, match.ring, measurement.pose, settings)
+        return measurement
     start = initial_pose(grey, camera, target, match)
     visible = _check_plate(grey, camera, target, match.ring, start.pose, settings)
-    observation = measure_by_model(grey, camera, target, start, prior, visible)
-    check_chance(observation, target, match.ring, settings.false_alarm)
-    return observation
+    measurement = measure_by_model(grey, camera, target, start, prior, visible)
+    check_chance(measurement, target, match.ring, settings.false_alarm)
+    return measurement
 
 
 def _check_plate(

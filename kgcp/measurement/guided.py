@@ -77,10 +77,10 @@ class Prediction:
         reach = self.radius_px * math.exp(_SIGMAS * self.sd_log_radius) + _SIGMAS * self.sd_px
         return bool(max(-x, x - camera.width + 1.0, -y, y - camera.height + 1.0) > reach)
 
-    def check(self, observation: Measurement) -> None:
-        """Raise `Rejection` (`POOR_FIT`) unless an observation agrees, in place and in radius."""
-        off_px = float(np.linalg.norm(observation.centre_px - self.centre_px))
-        ratio = observation.appearance.radius_px / self.radius_px
+    def check(self, measurement: Measurement) -> None:
+        """Raise `Rejection` (`POOR_FIT`) unless a measurement agrees, in place and in radius."""
+        off_px = float(np.linalg.norm(measurement.centre_px - self.centre_px))
+        ratio = measurement.appearance.radius_px / self.radius_px
         if off_px > _SIGMAS * self.sd_px or abs(math.log(ratio)) > _SIGMAS * self.sd_log_radius:
             raise Rejection(Reason.POOR_FIT, f"{off_px:.1f} px and {ratio - 1.0:+.0%} off; {self}")
 
@@ -107,7 +107,7 @@ def measure_guided(
 
     Returns
     -------
-    observation : Measurement or None
+    measurement : Measurement or None
         The first that passes. The main ring's candidates are tried before the replicas'.
     considered : tuple of Considered
         All candidates that were tried.
@@ -121,12 +121,12 @@ def measure_guided(
         if any(rival.covers(candidate.outline) for rival in rivals):
             continue
         try:
-            observation = measure_match(grey, camera, target, match, lowered, prior)
-            prediction.check(observation)
+            measurement = measure_match(grey, camera, target, match, lowered, prior)
+            prediction.check(measurement)
         except Rejection as rejection:
             considered.append(replace(candidate, reason=rejection.reason, detail=rejection.detail))
             continue
-        return replace(observation, is_guided=True), (*considered, candidate)
+        return replace(measurement, is_guided=True), (*considered, candidate)
     return None, tuple(considered)
 
 

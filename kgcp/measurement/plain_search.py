@@ -52,9 +52,9 @@ def edges_like(
     ]
     follow_px = max(_REACH * expected.mean_radius, _LEAST_REACH_PX)
     followed = follow_outlines(grey, guesses, follow_px)
-    found = [outline for outline in followed if outline is not None]
+    outlines = [outline for outline in followed if outline is not None]
     distinct: list[DiscOutline] = []
-    for outline in sorted(found, key=lambda each: each.residual_px):
+    for outline in sorted(outlines, key=lambda each: each.residual_px):
         if not any(_is_same(outline, other) for other in distinct):
             distinct.append(outline)
     return sorted(distinct, key=lambda each: abs(_log_size(each.ellipse, expected)))

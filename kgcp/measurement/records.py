@@ -77,7 +77,7 @@ class Imaging:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
-    """Covariances of one observation.
+    """Covariances of one measurement.
 
     Attributes
     ----------

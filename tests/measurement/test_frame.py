@@ -50,15 +50,15 @@ def test_distance_and_centre_are_the_plate_s(
     turn_deg: float,
 ) -> None:
     pose = place_plate((205.4, 190.7), radius_px, tilt_deg=22.0, way_deg=200.0, turn_deg=turn_deg)
-    (observation,) = measured(draw_frame((target, pose)), camera, target)
+    (measurement,) = measured(draw_frame((target, pose)), camera, target)
     truth_px = camera.project(pose.translation_m)
-    assert observation.ring == "A"
-    assert observation.score > 0.95
-    assert np.linalg.norm(observation.centre_px - truth_px) < centre_px
-    assert observation.pose.distance_m == pytest.approx(pose.distance_m, rel=0.01 * percent)
-    heading = observation.heading_deg - image_heading_deg(camera, pose)
+    assert measurement.ring == "A"
+    assert measurement.score > 0.95
+    assert np.linalg.norm(measurement.centre_px - truth_px) < centre_px
+    assert measurement.pose.distance_m == pytest.approx(pose.distance_m, rel=0.01 * percent)
+    heading = measurement.heading_deg - image_heading_deg(camera, pose)
     assert abs((heading + 180.0) % 360.0 - 180.0) < 1.5
-    assert observation.appearance.radius_px == pytest.approx(radius_px, rel=0.03)
+    assert measurement.appearance.radius_px == pytest.approx(radius_px, rel=0.03)
 
 
 @pytest.mark.parametrize("way_deg", [0.0, 75.0, 160.0, 290.0])
@@ -66,14 +66,14 @@ def test_a_large_ring_tells_its_two_poses_apart(
     target: Target, camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame, way_deg: float
 ) -> None:
     pose = place_plate((260.0, 170.0), 90.0, tilt_deg=25.0, way_deg=way_deg, turn_deg=40.0)
-    (observation,) = measured(draw_frame((target, pose)), camera, target)
-    np.testing.assert_allclose(observation.pose.rotation, pose.rotation, atol=0.01)
-    other = observation.alternative
+    (measurement,) = measured(draw_frame((target, pose)), camera, target)
+    np.testing.assert_allclose(measurement.pose.rotation, pose.rotation, atol=0.01)
+    other = measurement.alternative
     assert other is not None
     assert other.ambiguity > 0.2
-    assert other.pose.distance_m == pytest.approx(observation.pose.distance_m, rel=1e-6)
-    ray = observation.pose.translation_m / observation.pose.distance_m
-    assert other.pose.normal @ ray == pytest.approx(observation.pose.normal @ ray, abs=0.01)
+    assert other.pose.distance_m == pytest.approx(measurement.pose.distance_m, rel=1e-6)
+    ray = measurement.pose.translation_m / measurement.pose.distance_m
+    assert other.pose.normal @ ray == pytest.approx(measurement.pose.normal @ ray, abs=0.01)
 
 
 def test_overexposure_shows_as_an_edge_shift_and_as_clipped_pixels(
@@ -144,10 +144,10 @@ def test_two_plates_of_one_code_are_two_instances(
     target: Target, camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
 ) -> None:
     plates = [(target, place_plate((x, 180.0), 40.0, turn_deg=x)) for x in (110.0, 340.0)]
-    observations = measured(draw_frame(*plates), camera, target)
-    assert [observation.instance for observation in observations] == [0, 1]
-    assert sorted(round(observation.centre_px[0], -1) for observation in observations) == [110, 340]
-    assert observations[0].score >= observations[1].score
+    measurements = measured(draw_frame(*plates), camera, target)
+    assert [measurement.instance for measurement in measurements] == [0, 1]
+    assert sorted(round(measurement.centre_px[0], -1) for measurement in measurements) == [110, 340]
+    assert measurements[0].score >= measurements[1].score
 
 
 def test_each_target_has_its_own_outcome_in_order(
@@ -165,12 +165,12 @@ def test_the_replica_serves_where_the_frame_cuts_the_ring(
     target: Target, camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
 ) -> None:
     pose = place_plate((240.0, 40.0), 90.0, turn_deg=35.0)
-    (observation,) = measured(draw_frame((target, pose)), camera, target)
-    assert observation.ring == "A-inner"
-    assert observation.target == "A"
-    assert np.linalg.norm(observation.centre_px - camera.project(pose.translation_m)) < 0.1
-    assert observation.pose.distance_m == pytest.approx(pose.distance_m, rel=0.01)
-    assert observation.appearance.radius_px == pytest.approx(90.0, rel=0.02)
+    (measurement,) = measured(draw_frame((target, pose)), camera, target)
+    assert measurement.ring == "A-inner"
+    assert measurement.target == "A"
+    assert np.linalg.norm(measurement.centre_px - camera.project(pose.translation_m)) < 0.1
+    assert measurement.pose.distance_m == pytest.approx(pose.distance_m, rel=0.01)
+    assert measurement.appearance.radius_px == pytest.approx(90.0, rel=0.02)
 
 
 def test_the_replica_on_another_plate_is_not_this_target(

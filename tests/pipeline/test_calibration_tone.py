@@ -88,7 +88,7 @@ def test_what_was_measured_with_another_tone_is_measured_anew(tmp_path: Path) ->
     photo = Photo("a.png", tmp_path / "a.png")
     photo.path.write_bytes(b"nothing")
     pool, kinds = MeasuringPool(1, SerialExecutor(), (), Counter()), (PhotoDiscs, PhotoMiss)
-    tones = (None, replace(UNRELIABLE, known=ProcessingPrior.usual()), UNRELIABLE, UNRELIABLE)
+    tones = (None, replace(UNRELIABLE, prior=ProcessingPrior.usual()), UNRELIABLE, UNRELIABLE)
     results = []
     opened = Journal[PhotoDiscs | PhotoMiss](
         tmp_path / "journal", {"by": "test"}, kinds, is_new=False

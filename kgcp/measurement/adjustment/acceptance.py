@@ -54,7 +54,7 @@ def check_fit(fit: TargetFit) -> None:
         )
 
 
-def check_precision(observation: Measurement) -> None:
+def check_precision(measurement: Measurement) -> None:
     """Refuse a measurement so uncertain that it can hardly be of this target.
 
     Even far, blurred and badly exposed targets are measured to some parts in a thousand. Clutter
@@ -65,10 +65,10 @@ def check_precision(observation: Measurement) -> None:
     Rejection
         `POOR_FIT`.
     """
-    if observation.uncertainty is None:
+    if measurement.uncertainty is None:
         return
-    relative_sd = observation.uncertainty.sd_distance_m / observation.pose.distance_m
-    is_small = observation.appearance.radius_px < SMALL_RING_PX
+    relative_sd = measurement.uncertainty.sd_distance_m / measurement.pose.distance_m
+    is_small = measurement.appearance.radius_px < SMALL_RING_PX
     if relative_sd > (_MAX_RELATIVE_SD_OF_SMALL if is_small else _MAX_RELATIVE_SD):
         raise Rejection(Reason.POOR_FIT, f"distance uncertain by {relative_sd:.1%}")
 

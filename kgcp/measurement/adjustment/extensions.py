@@ -133,8 +133,8 @@ def fit_in_any_light(
     """
     try:
         return _fit_over_bases(problem, pose, blur, base)
-    except WhiteIsBurnt as found:
-        return _fit_over_bases(replace(found.problem, tone=problem.tone), pose, blur, base)
+    except WhiteIsBurnt as burnt:
+        return _fit_over_bases(replace(burnt.problem, tone=problem.tone), pose, blur, base)
 
 
 def _fit_over_bases(
@@ -178,8 +178,8 @@ def with_untried_base(fits: FitsByTone, pose: Pose, blur: Blur) -> FitsByTone:
         other = _fit_in_any_light(toned, pose, blur, find_plateaus)
     except Rejection:
         return replace(fits, untried_base=None)
-    except WhiteIsBurnt as found:
-        return fit_in_any_light(replace(found.problem, tone=Tone.UNKNOWN), pose, blur)
+    except WhiteIsBurnt as burnt:
+        return fit_in_any_light(replace(burnt.problem, tone=Tone.UNKNOWN), pose, blur)
     (first,) = set(ToneBase) - {fits.untried_base}
     return _by_likelihood({first: fits.likelier, fits.untried_base: other})
 

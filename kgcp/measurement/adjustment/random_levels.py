@@ -181,12 +181,12 @@ def fit_other_pose(first: TargetFit, other: Pose) -> tuple[TargetFit, TargetFit]
     best, other : TargetFit
         The better and the worse one.
     """
-    there = moved_to(first, other)
-    if there.total > first.total + _HOPELESS_AT_ONCE:
-        return first, there
+    unadjusted = moved_to(first, other)
+    if unadjusted.total > first.total + _HOPELESS_AT_ONCE:
+        return first, unadjusted
     second = _minimise(
         first.sample,
-        there.parameters,
+        unadjusted.parameters,
         first.sd,
         first.unknowns,
         _equations_of(first).at_knots,

@@ -166,12 +166,12 @@ def _mirrored_fit(fit: TargetFit, hopeless: float = _HOPELESS) -> TargetFit:
 
 def fit_at(fit: TargetFit, pose: Pose) -> TargetFit:
     """Fit another pose to the pixels of a fit; if that is hopeless, return it as it is."""
-    there = moved_to(fit, pose)
-    if there.total - fit.total > _HOPELESS:
-        return there
+    unadjusted = moved_to(fit, pose)
+    if unadjusted.total - fit.total > _HOPELESS:
+        return unadjusted
     return minimise(
         fit.sample,
-        there.parameters,
+        unadjusted.parameters,
         fit.sd,
         fit.unknowns,
         steps=_MIRRORED_STEPS[-1],

@@ -99,7 +99,7 @@ class CameraTone:
 
     tone: Tone
     sharpening_px: float = 0.0  # σ of its unsharp mask; 0: it does not sharpen
-    known: ProcessingPrior | None = None
+    prior: ProcessingPrior | None = None  # of tone curve and sharpening; None: nothing is learned
     blur_px: float = 0.0  # median of the discs that it was learned from; 0: none
     kurtosis: float = 0.0  # excess kurtosis of its point spread
     is_curve_unknown: bool = False  # False: the curve is stated
@@ -155,16 +155,16 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
         best = _before_compression(best, start, steps)
         is_reliable = best.is_settled and not _are_coarse(steps)
     blur_px = float(np.median([fit.state.blur.mean_sd_px for fit in best.fits]))
-    known = _known_by(best)
+    prior = _prior_by(best)
     if camera.is_curve_unknown and not best.tone.is_shaped and _are_burnt(fits):
         # the curve's upper end is not seen: what it may be off stays in the covariances
-        known = _slightly_bent(known)
+        prior = _slightly_bent(prior)
         best = replace(best, tone=_BENT[best.tone])
     return replace(
         camera,
         tone=best.tone,
         sharpening_px=best.sharpening_px,
-        known=known,
+        prior=prior,
         blur_px=blur_px,
         is_reliable=is_reliable,
     )
@@ -174,7 +174,7 @@ def unknowns_of_disc(task: DiscTask, camera: CameraTone) -> DiscUnknowns:
     """Return the unknowns of a disc, with what is known of the camera."""
     return DiscUnknowns.of(
         camera.tone,
-        camera.known,
+        camera.prior,
         sharpening_px=camera.sharpening_px,
         has_ink_slope=not camera.tone.is_shaped and task.radius_px >= _LARGE_RADIUS_PX,
         kurtosis=camera.kurtosis,
@@ -298,15 +298,15 @@ def _worth_comparing(plain: Sequence[JointFit], bent: Sequence[JointFit]) -> lis
     likelier plain curve, it is the bent line alone, unless bent sRGB is much likelier: sRGB's curve
     bent nearly straight keeps a bend at its dark end, which makes discs too large or too small.
     """
-    known, best = _likeliest(plain), _likeliest(bent)
-    if known is None or best is None:
-        return [joint for joint in (best or known,) if joint]
-    gain = known.loss - best.loss
+    unbent, best = _likeliest(plain), _likeliest(bent)
+    if unbent is None or best is None:
+        return [joint for joint in (best or unbent,) if joint]
+    gain = unbent.loss - best.loss
     if 2.0 * gain <= _SIGNIFICANT_BENDS * _excess(best) ** _EXCESS_POWER:
-        return [known]
+        return [unbent]
     line = next((joint for joint in bent if joint.tone is Tone.UNKNOWN_FROM_LINE), None)
-    if known.tone is Tone.LINEAR and line is not None:
-        farther = max(joint.loss for joint in plain) - known.loss
+    if unbent.tone is Tone.LINEAR and line is not None:
+        farther = max(joint.loss for joint in plain) - unbent.loss
         if line.loss - best.loss <= _LINE_PREFERENCE * farther:
             return [line]
     return [joint for joint in bent if joint.loss - best.loss < _NEARLY_AS_LIKELY * gain]
@@ -317,12 +317,12 @@ def _are_burnt(fits: Sequence[DiscFit]) -> bool:
     return float(np.mean([fit.sample.is_burnt for fit in fits])) > 0.5
 
 
-def _slightly_bent(known: ProcessingPrior) -> ProcessingPrior:
+def _slightly_bent(prior: ProcessingPrior) -> ProcessingPrior:
     """Return what is known of the camera, with bends free by a small standard deviation."""
-    precision = known.precision.copy()
+    precision = prior.precision.copy()
     waves = np.arange(WAVES)
     precision[waves, waves] = _LITTLE_BENT**-2
-    return ProcessingPrior(known.mean, precision)
+    return ProcessingPrior(prior.mean, precision)
 
 
 def _from_first_fits(fits: Sequence[DiscFit], tone: Tone) -> JointFit | None:
@@ -527,7 +527,7 @@ def _state_by(fit: DiscFit, tone: Tone, sharpening: float) -> DiscState:
     return DiscState(vector)
 
 
-def _known_by(joint: JointFit) -> ProcessingPrior:
+def _prior_by(joint: JointFit) -> ProcessingPrior:
     """Return what discs adjusted together say of the camera, with its precision.
 
     The precision is divided by the excess by which discs contradict each other.

@@ -112,27 +112,27 @@ def measure_by_gaussian(task: DiscTask) -> Disc | DiscMiss:
         return target_function(p, places)[1].T
 
     scale = np.array((1.0, 1.0, 1.0, 1.0, 1.0, 0.1, 0.1, 0.1))
-    found = least_squares(residuals, start, slopes, x_scale=scale, method="lm", max_nfev=60)
+    solution = least_squares(residuals, start, slopes, x_scale=scale, method="lm", max_nfev=60)
     freedom = len(levels) - len(start)
-    scaled = target_function(found.x, places)[1]
+    scaled = target_function(solution.x, places)[1]
     normal = scaled @ scaled.T
-    if not found.success or np.linalg.cond(normal) > 1e15 or abs(found.x[7]) < 1e-6:
+    if not solution.success or np.linalg.cond(normal) > 1e15 or abs(solution.x[7]) < 1e-6:
         return DiscMiss(task.outline, DiscReason.POOR_FIT, "no solution")
-    inverse = np.linalg.inv(normal) * (2.0 * found.cost / freedom)
-    x, y, xx, xy, yy = found.x[:5].tolist()
+    inverse = np.linalg.inv(normal) * (2.0 * solution.cost / freedom)
+    x, y, xx, xy, yy = solution.x[:5].tolist()
     moments = 0.25 * np.array((xx * xx + xy * xy, xy * (xx + yy), xy * xy + yy * yy))
     vector = np.array((x, y, *moments))
     if not 0.5 < ellipse_of_moments(vector).mean_radius / radius_px < 2.0:
         return DiscMiss(task.outline, DiscReason.POOR_FIT, "another size than its outline")
-    to_moments = moments_by_stretch(found.x[:5])
+    to_moments = moments_by_stretch(solution.x[:5])
     return Disc(
         outline=task.outline,
         vector=vector,
         cov=to_moments @ inverse[:5, :5] @ to_moments.T,
-        inside=float(found.x[5] + found.x[6]),
-        outside=float(found.x[6]),
+        inside=float(solution.x[5] + solution.x[6]),
+        outside=float(solution.x[6]),
         gradient=np.zeros(2),
-        blur_px=0.5 * abs(float(found.x[7])) * radius_px,
+        blur_px=0.5 * abs(float(solution.x[7])) * radius_px,
         clipped=math.nan,
         inflation=1.0,
         pixels=len(levels),

@@ -119,7 +119,7 @@ class DiscUnknowns:
     def of(
         cls,
         tone: Tone,
-        camera: ProcessingPrior | None = None,
+        prior: ProcessingPrior | None = None,
         *,
         sharpening_px: float = 0.0,
         has_ink_slope: bool = False,
@@ -132,7 +132,7 @@ class DiscUnknowns:
 
         Parameters
         ----------
-        camera : ProcessingPrior
+        prior : ProcessingPrior
             What is learned of tone and sharpening; None: what is known of any camera.
         sharpening_px : float
             σ of the camera's unsharp mask [px]; 0: it does not sharpen.
@@ -152,7 +152,7 @@ class DiscUnknowns:
         rows += (Row.SHARPENING,) if sharpening_px else ()
         rows += _INK_SLOPES if has_ink_slope else ()
         free = np.array(sorted(map(int, rows)))
-        known = camera or ProcessingPrior.usual()
+        known = prior or ProcessingPrior.usual()
         mean, precision = np.zeros(COUNT), np.zeros((COUNT, COUNT))
         for row, sd in _PRIOR_SD.items():
             precision[row, row] = sd**-2

@@ -149,11 +149,11 @@ def _measured(
     camera = learn_tone([tasks], response) if camera is None else camera
     outcomes = [_fitted(task, camera) for task in tasks]
     fits = [each for each in outcomes if not isinstance(each, DiscMiss)]
-    found = iter(inflations([scatter for _, scatter in fits]).tolist())
+    factors = iter(inflations([scatter for _, scatter in fits]).tolist())
     return [
         each
         if isinstance(each, DiscMiss)
-        else _refuse_uncertain(_disc(*each, task.outline, next(found)))
+        else _refuse_uncertain(_disc(*each, task.outline, next(factors)))
         for task, each in zip(tasks, outcomes, strict=True)
     ]
 

@@ -53,7 +53,7 @@ _RIPPLE_PX, _RIPPLE = 4.0, 0.15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Edges:
+class _FittedEdges:
     """Ellipses through edge points, for n candidates."""
 
     ellipses: FloatArray  # (n, 5): centre and symmetric stretch
@@ -98,13 +98,13 @@ def follow_outlines(
     signs = np.array([_sign(each.polarity) for each in guesses])
     # in the first pass a guess may be off by its whole reach, even if that is much of its radius
     reaches_px = [np.full(len(guesses), reach_px), None, None]
-    found = _edges_of(grey, ellipses, signs, reaches_px)
-    is_disc = _is_disc(found)
-    axes = _semi_axes(found.ellipses)
-    off_px = np.linalg.norm(found.ellipses[:, :2] - ellipses[:, :2], axis=1)
+    fitted = _edges_of(grey, ellipses, signs, reaches_px)
+    is_disc = _is_disc(fitted)
+    axes = _semi_axes(fitted.ellipses)
+    off_px = np.linalg.norm(fitted.ellipses[:, :2] - ellipses[:, :2], axis=1)
     off_px = np.maximum(off_px, np.abs(axes - _semi_axes(ellipses)).max(axis=1))
     return tuple(
-        replace(_outline(found, i, guess.polarity), hole=guess.hole, is_hole=guess.is_hole)
+        replace(_outline(fitted, i, guess.polarity), hole=guess.hole, is_hole=guess.is_hole)
         if is_disc[i] and off_px[i] <= reach_px
         else None
         for i, guess in enumerate(guesses)
@@ -118,9 +118,9 @@ def _follow(
     if not len(ellipses):
         return []
     signs = np.array([_sign(each) for each in polarities])
-    found = _edges_of(grey, ellipses, signs, [None] * len(_REACHES))
-    chosen = _distinct(found, signs, np.flatnonzero(_is_disc(found)))
-    return [_outline(found, i, polarities[i]) for i in chosen]
+    fitted = _edges_of(grey, ellipses, signs, [None] * len(_REACHES))
+    chosen = _distinct(fitted, signs, np.flatnonzero(_is_disc(fitted)))
+    return [_outline(fitted, i, polarities[i]) for i in chosen]
 
 
 def _sign(polarity: Polarity) -> float:
@@ -128,19 +128,19 @@ def _sign(polarity: Polarity) -> float:
     return 1.0 if polarity is Polarity.DARK else -1.0
 
 
-def _is_disc(found: _Edges) -> BoolArray:
+def _is_disc(fitted: _FittedEdges) -> BoolArray:
     """Tell which candidates (n,) have the edge of an ellipse."""
-    axes = _semi_axes(found.ellipses)
+    axes = _semi_axes(fitted.ellipses)
     radius = np.sqrt(axes[:, 0] * axes[:, 1])
-    is_disc = found.shares >= _LEAST_INLIERS
-    is_disc &= found.residual_px <= np.hypot(_RESIDUAL_PX, _RESIDUAL * radius)
+    is_disc = fitted.shares >= _LEAST_INLIERS
+    is_disc &= fitted.residual_px <= np.hypot(_RESIDUAL_PX, _RESIDUAL * radius)
     is_disc &= (axes[:, 1] >= _LEAST_SEMI_AXIS_PX) & (axes[:, 0] <= _MOST_ASPECT * axes[:, 1])
-    return np.asarray(is_disc & (found.contrast >= _LEAST_CONTRAST))
+    return np.asarray(is_disc & (fitted.contrast >= _LEAST_CONTRAST))
 
 
-def _outline(found: _Edges, i: int, polarity: Polarity) -> DiscOutline:
-    contrast, residual_px = float(found.contrast[i]), float(found.residual_px[i])
-    return DiscOutline(_ellipse(found.ellipses[i]), polarity, contrast, residual_px)
+def _outline(fitted: _FittedEdges, i: int, polarity: Polarity) -> DiscOutline:
+    contrast, residual_px = float(fitted.contrast[i]), float(fitted.residual_px[i])
+    return DiscOutline(_ellipse(fitted.ellipses[i]), polarity, contrast, residual_px)
 
 
 def _edges_of(
@@ -148,7 +148,7 @@ def _edges_of(
     ellipses: FloatArray,
     signs: FloatArray,
     reaches_px: Sequence[FloatArray | None],
-) -> _Edges:
+) -> _FittedEdges:
     """Fit ellipses to edges, in passes; each starts from the last and looks less far.
 
     `reaches_px` says how far, for each pass; None: in proportion to the radius.
@@ -174,7 +174,7 @@ def _edges_of(
         mark_inliers(edges, strengths, ellipses, fitted, limits_px, inlying, residual_px)
         ellipses = _carried(ellipses, fitted)
     contrast = _contrast(levels, inlying) / brightest_level(grey)
-    return _Edges(
+    return _FittedEdges(
         ellipses, np.where(shares > 0.0, inlying.mean(axis=1), 0.0), residual_px, contrast
     )
 
@@ -231,14 +231,14 @@ def tree_of(points: FloatArray) -> cKDTree:
     return cKDTree(points)
 
 
-def _distinct(found: _Edges, signs: FloatArray, candidates: IndexArray) -> list[int]:
+def _distinct(fitted: _FittedEdges, signs: FloatArray, candidates: IndexArray) -> list[int]:
     """Return the best candidate of every edge, in reading order."""
-    best = sorted(candidates.tolist(), key=lambda i: (found.residual_px[i], i))
+    best = sorted(candidates.tolist(), key=lambda i: (fitted.residual_px[i], i))
     if not best:
         return []
     centres, radius = (
-        found.ellipses[best, :2],
-        found.ellipses[:, 2:].take((0, 2), axis=1).mean(axis=1),
+        fitted.ellipses[best, :2],
+        fitted.ellipses[:, 2:].take((0, 2), axis=1).mean(axis=1),
     )
     tree, kept, taken = tree_of(centres), [], np.zeros(len(best), np.bool_)
     for place, i in enumerate(best):
@@ -250,7 +250,7 @@ def _distinct(found: _Edges, signs: FloatArray, candidates: IndexArray) -> list[
             ratio = radius[j] / radius[i]
             if signs[j] == signs[i] and 1.0 / _ALIKE < ratio < _ALIKE:
                 taken[other] = True
-    return sorted(kept, key=lambda i: (round(found.ellipses[i, 1]), found.ellipses[i, 0]))
+    return sorted(kept, key=lambda i: (round(fitted.ellipses[i, 1]), fitted.ellipses[i, 0]))
 
 
 def _without_ripples(outlines: list[DiscOutline]) -> list[DiscOutline]:

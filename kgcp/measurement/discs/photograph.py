@@ -84,7 +84,7 @@ def learn_from_fields(greys: Iterable[GreyArray], task: PhotoTask) -> CameraTone
         own = [each for each in outlines if each.polarity.value == task.field.polarity.value]
         photographs.append((grey, own))
     camera = learn_camera(photographs, task.response, ground=_ground(task.field))
-    return None if camera.known is None else camera
+    return None if camera.prior is None else camera
 
 
 def measure_field(
@@ -159,8 +159,8 @@ def _ground(field: AnyField) -> float:
 def _are_in_one_row(points_m: FloatArray) -> bool:
     """Tell whether points (k, 3) of a plane determine no homography: all but one are in a row."""
     for left_out in range(len(points_m)):
-        rest = np.delete(points_m, left_out, axis=0)
-        widths = np.linalg.svd(rest - rest.mean(axis=0), compute_uv=False)
+        others = np.delete(points_m, left_out, axis=0)
+        widths = np.linalg.svd(others - others.mean(axis=0), compute_uv=False)
         if widths[1] < _LEAST_WIDTH * widths[0]:
             return True
     return False

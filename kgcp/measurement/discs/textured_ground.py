@@ -90,8 +90,8 @@ def fit_on_texture(
         hardly any ground is left.
     """
     sample, state = _sample_with_all_ground(fit, others), fit.state
-    now = _linearised(fit, sample, state)
-    seen, ground_share = _is_seen(now), _ground_share(now)
+    current = _linearised(fit, sample, state)
+    seen, ground_share = _is_seen(current), _ground_share(current)
     is_ground, is_disc = ground_share > _GROUND, ground_share < _DISC
     for part in (is_ground, is_disc):
         if np.count_nonzero(part) < _FEWEST or np.mean(~seen[part]) > _MUCH_CLIPPED:
@@ -102,11 +102,11 @@ def fit_on_texture(
     every = math.ceil(len(narrow) / _TEXTURE_SECTORS)
     modes = TextureModes.of([each.only(is_ground & seen) for each in narrow[::every]])
     for number in range(_ROUNDS):
-        noise = _noise(now)
+        noise = _noise(current)
         if number < _TEXTURE_ROUNDS:
-            columns = np.vstack((_by_ground(now), now.jacobian[_SLOPES])).T
-            texture = modes.likeliest(columns, sample.levels - now.levels, noise)
-        normal, gradient = _with_priors(now, _equations(now, sectors, texture, noise))
+            columns = np.vstack((_by_ground(current), current.jacobian[_SLOPES])).T
+            texture = modes.likeliest(columns, sample.levels - current.levels, noise)
+        normal, gradient = _with_priors(current, _equations(current, sectors, texture, noise))
         step = np.zeros(COUNT)
         step[fit.free.rows] = np.linalg.solve(normal, gradient)
         if not np.isfinite(step).all():
@@ -115,12 +115,12 @@ def fit_on_texture(
         moved_px = float(np.abs(step[:GEOMETRY_COUNT]).max())
         if number >= _TEXTURE_ROUNDS and moved_px < _SETTLED_PX:
             break
-        now = _linearised(fit, sample, state)
+        current = _linearised(fit, sample, state)
     if moved_px > _UNSETTLED_PX:
         raise NoFit
     arcs = sectors_about(centre_px, places_px, math.ceil(places_px.shape[1] / scatter.arcs))
     return replace(fit, state=state), _scatter(
-        scatter, state, normal, _equations(now, arcs, texture, noise)
+        scatter, state, normal, _equations(current, arcs, texture, noise)
     )
 
 
@@ -233,9 +233,9 @@ def _scatter(
     )
     to_moments = moments_by_stretch(state.geometry)
     independent = to_moments @ own[:, :GEOMETRY_COUNT] @ to_moments.T
-    found = replace(plain, independent=independent, ratio=ratio)
+    textured = replace(plain, independent=independent, ratio=ratio)
     if mean_radius_px(state.geometry) <= _ONE_GROUND_PX:
-        return found
-    least, stated = (float(inflations([each])[0]) * each.independent for each in (plain, found))
+        return textured
+    least, stated = (float(inflations([each])[0]) * each.independent for each in (plain, textured))
     scale = float(np.trace(np.linalg.solve(stated, least))) / GEOMETRY_COUNT
-    return replace(found, independent=max(scale, 1.0) * independent)
+    return replace(textured, independent=max(scale, 1.0) * independent)

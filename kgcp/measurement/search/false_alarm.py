@@ -53,7 +53,7 @@ def _power(ring: Ring) -> FloatArray:
     return np.asarray(power / power.sum(axis=1, keepdims=True))
 
 
-def check_chance(observation: Measurement, target: Target, ring: Ring, false_alarm: float) -> None:
+def check_chance(measurement: Measurement, target: Target, ring: Ring, false_alarm: float) -> None:
     """Refuse a code that a frame may show by chance; without a blur estimate nothing is refused.
 
     Parameters
@@ -68,14 +68,14 @@ def check_chance(observation: Measurement, target: Target, ring: Ring, false_ala
     Rejection
         `CODE_MISMATCH`.
     """
-    appearance = observation.appearance
+    appearance = measurement.appearance
     if appearance.blur_px is None:
         return
     code_radius_px = appearance.radius_px * ring.code_diameter_m / target.ring.outer_diameter_m
-    chance = code_chance(observation.score, ring, appearance.blur_px / code_radius_px)
+    chance = code_chance(measurement.score, ring, appearance.blur_px / code_radius_px)
     if RINGS_PER_FRAME * chance > false_alarm:
         raise Rejection(
             Reason.CODE_MISMATCH,
-            f"score {observation.score:.2f} comes about by chance in {RINGS_PER_FRAME * chance:.0e}"
+            f"score {measurement.score:.2f} comes about by chance in {RINGS_PER_FRAME * chance:.0e}"
             f" of all frames, allowed are {false_alarm:.0e}",
         )

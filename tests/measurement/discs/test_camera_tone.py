@@ -86,12 +86,12 @@ def test_curve_and_sharpening_are_those_of_the_camera(
     grey = photograph(CAMERA, POSE, scene, Optics(0.6), sensor, rng)
     tasks = [DiscTask(grey, outline, []) for outline in find_outlines(grey)]
     camera = learn_tone([tasks], Response.UNKNOWN)
-    assert camera.known is not None
+    assert camera.prior is not None
     assert 0.65 < camera.sharpening_px < 0.97
-    assert camera.known.mean[3] == pytest.approx(0.5, abs=0.25)
+    assert camera.prior.mean[3] == pytest.approx(0.5, abs=0.25)
     assert camera.tone is tone
     tolerance = 0.25 if any(waves) else 0.1
-    assert camera.known.mean[:3] == pytest.approx(waves, abs=tolerance)
+    assert camera.prior.mean[:3] == pytest.approx(waves, abs=tolerance)
 
 
 def small_discs(
@@ -151,9 +151,9 @@ def test_what_is_usual_of_burnt_white_does_not_bend_the_curve() -> None:
     """Said by each disc, it did: first wave −0.19."""
     tasks = small_discs(Sensor(tone=ToneCurve.FILM), (0.62, 0.1), 0.004, 0)
     learned = learn_tone(tasks, Response.UNKNOWN)
-    assert learned.known is not None
+    assert learned.prior is not None
     assert learned.tone is Tone.UNKNOWN
-    assert learned.known.mean[:3] == pytest.approx((0.0, -0.7, 0.0), abs=0.1)
+    assert learned.prior.mean[:3] == pytest.approx((0.0, -0.7, 0.0), abs=0.1)
 
 
 @pytest.mark.parametrize(
@@ -163,10 +163,10 @@ def test_noise_does_not_bend_a_straight_line(levels: tuple[float, float], seed: 
     """Sharpened or not; of small discs, a curve that is bent by chance makes them 1 % larger."""
     tasks = small_discs(Sensor(sharpening=0.5 * (seed > 0)), levels, 0.0, seed)
     learned = learn_tone(tasks, Response.UNKNOWN)
-    assert learned.known is not None
+    assert learned.prior is not None
     assert learned.tone is Tone.LINEAR
-    assert learned.known.mean[:3].tolist() == [0.0, 0.0, 0.0]
-    assert learned.known.mean[3] == pytest.approx(0.5 * (seed > 0), abs=0.15)
+    assert learned.prior.mean[:3].tolist() == [0.0, 0.0, 0.0]
+    assert learned.prior.mean[3] == pytest.approx(0.5 * (seed > 0), abs=0.15)
 
 
 def test_the_edge_of_a_shadow_does_not_bend_the_curve() -> None:
@@ -187,9 +187,9 @@ def test_the_edge_of_a_shadow_does_not_bend_the_curve() -> None:
     camera = learn_tone(
         [[DiscTask(grey, outline, []) for outline in find_outlines(grey)]], Response.UNKNOWN
     )
-    assert camera.known is not None
+    assert camera.prior is not None
     assert camera.tone is Tone.LINEAR
-    assert camera.known.mean[:4] == pytest.approx(np.zeros(4), abs=0.02)
+    assert camera.prior.mean[:4] == pytest.approx(np.zeros(4), abs=0.02)
 
 
 def test_a_disc_that_begins_far_off_does_not_run_away_from_all_others() -> None:

@@ -242,9 +242,9 @@ def test_film_s_curve_is_learned_through_jpeg() -> None:
     """From the compressed values themselves it was sRGB's, with waves of 0.03 at most."""
     tasks = tasks_of([compressed(photo, 92) for photo in small_discs(FILM, 0, 2)], 14)
     learned = learn_tone(tasks, Response.UNKNOWN)
-    assert learned.known is not None
+    assert learned.prior is not None
     assert learned.tone is Tone.UNKNOWN  # a line, bent, is likelier by 3
-    first, second, _, strength = learned.known.mean.tolist()
+    first, second, _, strength = learned.prior.mean.tolist()
     assert -1.4 < first + 2.0 * second < -0.6  # what the dark end is steeper by; film's: -1.4
     assert 0.4 < strength < 0.85
 
