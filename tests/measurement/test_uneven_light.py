@@ -415,7 +415,7 @@ def test_light_that_is_not_explained_makes_what_another_start_finds_part_of_the_
     start = start_near(LENS, pose, rng)
     explained = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
     other_pose = Pose(pose.rotation, 1.002 * explained.pose.translation_m)
-    monkeypatch.setattr(fit_target, "_UNEXPLAINED", 0.0)
+    monkeypatch.setattr(fit_target, "_UNEXPLAINED_INFLATION", 0.0)
     monkeypatch.setattr(fit_target, "fit_levels", resting_at(other_pose))
     seen = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
     assert seen.distance_m == explained.distance_m

@@ -163,12 +163,12 @@ def _fit_over_bases(
         except Rejection as rejection:
             failures[each] = rejection.reason, rejection.detail
     if not fits:
-        raise Rejection(*failures[ToneBase.LINE])  # whichever came first
+        raise Rejection(*failures[ToneBase.LINE])  # the same one, whichever was tried first
     return _by_likelihood(fits)
 
 
 def with_untried_base(fits: FitsByTone, pose: Pose, blur: Blur) -> FitsByTone:
-    """Return the fits with the one over the base that was not tried, unless it fails."""
+    """Fit over the base that was not tried, too; if that fails, the first fit stays alone."""
     if fits.untried_base is None:
         return fits
     tried = fits.likelier.best.sample.problem  # without burnt white

@@ -116,8 +116,7 @@ def select_pixels(
 def whole_plate(problem: FitProblem, pose: Pose, blur: Blur, light: Light) -> Sample:
     """Return all pixels of the ring and its border, hidden ones too, for pictures of residuals.
 
-    Left out are only pixels that blur certainly mixes with the surroundings of the plate, whatever
-    the pose.
+    Only pixels that blur mixes with the surroundings of the plate, whatever the pose, are left out.
     """
     seen = see_plate(problem, pose, blur)
     reach_m = (1.0 + _BORDER_RADII) * problem.outer_radius_m

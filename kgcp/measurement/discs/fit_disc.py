@@ -36,9 +36,7 @@ _LEAST_PROMISE = 0.02  # a step that promises a smaller gain in log-likelihood i
 _SMALL_SHARE = 1e-4  # of a step, for a numerical derivative along it
 _NOISE_ROUNDS, _SETTLED_NOISE = 8, 0.02
 _LEAST_RESIDUAL_SHARE = 0.25  # of a pixel's variance that its residual is taken to have, at least
-# Least degrees of freedom of the noise of an edge; with less, deviations at R 3 px were 10 % too
-# large.
-_LEAST_FREEDOM = 8.0
+_LEAST_FREEDOM = 8.0  # of an edge's noise; with less, deviations at R 3 px were 10 % too large
 _CLIP_SIGMAS = 2.5  # pixels modelled nearer to a clipping limit are not used for the noise
 _FEWEST_OF_NOISE = 8  # pixels
 # Largest margin to the clipping limits, as a share of the range between them. If it is reached,
@@ -134,18 +132,10 @@ class DiscUnknowns:
         ----------
         prior : ProcessingPrior
             What is learned of tone and sharpening; None: what is known of any camera.
-        sharpening_px : float
-            σ of the camera's unsharp mask [px]; 0: it does not sharpen.
         has_ink_slope : bool
             Whether the darker level has a gradient of its own: large discs.
-        is_tone_stated : bool
-            Whether the tone is the camera's, or one to start from.
-        kurtosis : float
-            Excess kurtosis of the camera's point spread.
-        is_curve_unknown : bool
-            Whether the tone curve is learned from discs.
-        is_compressed : bool
-            Whether the photograph is a JPEG, or was one.
+        sharpening_px, is_tone_stated, kurtosis, is_curve_unknown, is_compressed
+            As the attributes.
         """
         rows = [*_ALWAYS, *_LIGHT]
         rows += _WAVES if tone.is_shaped else ()
@@ -538,11 +528,10 @@ def _noise(
 ) -> GreyNoise:
     """Return the noise of every pixel, from those that are not clipped.
 
-    Just below a clipping limit, only pixels with negative noise are seen unclipped. When they were
+    Just below a clipping limit, only pixels with negative noise are not clipped. When they were
     used, the noise at the edges of burnt discs of R 3 px came out 28 % too small. So pixels are
-    chosen by their modelled level, a margin away from the limits. The margin needs a first estimate
-    of the noise. If a model that is far off puts too many pixels beyond it, all pixels that are not
-    clipped are used.
+    chosen by their modelled level, a margin away from the limits, which needs a first estimate of
+    the noise. If a model that is far off leaves too few of them, all unclipped pixels are used.
 
     If the camera's curve is stated to be sRGB's, the noise is estimated before the curve, where it
     grows with the light. After the curve, ink is noisier than paper, which `estimate_noise` rules

@@ -178,8 +178,8 @@ def compressed_fit_at(
 ) -> DiscFit:
     """Return a fit linearised at a state, with the noise (n,) before compression.
 
-    Misfit and scaled Jacobian are those of the coefficients, followed by those of pixels that are
-    not in a used block.
+    Misfit and scaled Jacobian are those of the coefficients, followed by those of pixels whose
+    block is clipped or not whole.
     """
     fit = disc_fit_at(sample, state, free, sd)
     if pixels is None:

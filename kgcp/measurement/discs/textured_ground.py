@@ -183,7 +183,7 @@ def _by_ground(fit: DiscFit) -> FloatArray:
 
 
 def _is_seen(fit: DiscFit) -> BoolArray:
-    """Return which pixels (n,) are not clipped, or are but are modelled below the limit."""
+    """Tell which pixels (n,) count: all but those that are clipped and modelled as clipped."""
     limits = fit.sample.censoring
     is_clipped = (limits.at_high & (fit.levels >= limits.high)) | (
         limits.at_low & (fit.levels <= limits.low)
@@ -194,7 +194,7 @@ def _is_seen(fit: DiscFit) -> BoolArray:
 def _equations(
     fit: DiscFit, sectors: Sequence[Sector], texture: GroundTexture, noise: float
 ) -> FloatArray:
-    """Return the equations (k, p, p + 1) of k sectors: normal matrix, and gradient in the end."""
+    """Return the equations (k, p, p + 1) of k sectors: normal matrices, and gradients as last column."""
     rows, by_ground, seen = fit.jacobian[fit.free.rows], _by_ground(fit), _is_seen(fit)
     both = np.vstack((rows, fit.sample.levels - fit.levels)).T
     products = np.zeros((len(sectors), len(rows), len(rows) + 1))

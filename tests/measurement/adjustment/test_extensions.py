@@ -216,7 +216,7 @@ def test_small_rings_are_in_even_light_where_levels_explain_little_more(
     monkeypatch.setattr(extensions, "fit_both_poses", lambda *_: plain)
     monkeypatch.setattr(extensions, "_with_shape", lambda _, poses: poses)
     monkeypatch.setattr(extensions, "needs_varying_levels", lambda _: True)
-    monkeypatch.setattr(extensions, "_with_levels", lambda *_: varying)
+    monkeypatch.setattr(extensions, "_with_varying_levels", lambda *_: varying)
     monkeypatch.setattr(extensions, "_with_edge_tone", lambda _, poses: poses)
     monkeypatch.setattr(extensions, "advantage_over", lambda *_: advantage)
     pose = Pose(np.eye(3), np.array([0.0, 0.0, 9.0]))
@@ -241,7 +241,7 @@ def test_bins_in_nearly_even_light_keep_the_levels_that_they_were_fitted_with(
     monkeypatch.setattr(extensions, "fit_both_poses", lambda *_: plain)
     monkeypatch.setattr(extensions, "_with_shape", lambda _, poses: poses)
     monkeypatch.setattr(extensions, "needs_varying_levels", lambda _: True)
-    monkeypatch.setattr(extensions, "_with_levels", with_levels)
+    monkeypatch.setattr(extensions, "_with_varying_levels", with_levels)
     monkeypatch.setattr(extensions, "_with_edge_tone", lambda _, poses: poses)
     monkeypatch.setattr(extensions, "_may_be_even", lambda *_: True)
     pose = Pose(np.eye(3), np.array([0.0, 0.0, 9.0]))
@@ -285,8 +285,8 @@ def test_levels_over_a_second_base_start_from_those_over_the_first(
         return varying
 
     monkeypatch.setattr(extensions, "fit_both_poses", fit_plain)
-    monkeypatch.setattr(extensions, "_in_seen_light", fit_evened)
-    monkeypatch.setattr(extensions, "_over_another_base", fit_over_another)
+    monkeypatch.setattr(extensions, "_fit_from_plateaus", fit_evened)
+    monkeypatch.setattr(extensions, "_fit_over_other_base", fit_over_another)
     monkeypatch.setattr(extensions, "_with_shape", lambda _, poses: poses)
     monkeypatch.setattr(extensions, "_with_edge_tone", lambda _, poses: poses)
     monkeypatch.setattr(extensions, "_with_kurtosis", lambda _, poses: poses)

@@ -390,7 +390,7 @@ def test_light_beyond_the_second_order_counts_as_an_error(monkeypatch: pytest.Mo
     photo, truth = under_shadows(0.45, 20.0, 3.0)
     rms_px, sd_px = rms_and_sd_px(photo, truth)
     assert 0.5 * sd_px < rms_px < 1.6 * sd_px
-    monkeypatch.setattr(covariance, "_bend_px", lambda _: np.zeros((2, 2)))
+    monkeypatch.setattr(covariance, "_curved_light_displacement_px", lambda _: np.zeros((2, 2)))
     assert 1.1 < sd_px / rms_and_sd_px(photo, truth)[1] < 1.5
 
 
