@@ -27,10 +27,7 @@ _SIGMAS = 4.0  # largest deviation from the prediction, in place and radius
 _SMALLEST_PX = 3.0  # least radius of a ring that is looked for
 _FARTHEST = 8.0  # largest deviation of the place in radii at which a prediction is of use
 _LARGEST_RATIO = 2.0  # largest ratio of a radius to the predicted one at which it is of use
-_SPACING, _RATIO = (
-    0.35,
-    1.25,
-)  # steps of places (in radii), and of radii, that rings are tracked from
+_SPACING, _RATIO = 0.35, 1.25  # steps of start places (in radii), and ratio of start radii
 _LOWER_SCORE = 0.06  # by so much the score may be lower than in the first look
 _MIN_SCORE_TO_TRY = 0.5  # of the whole ring
 _TRIES = 4  # per ring: only the best candidates are measured

@@ -19,9 +19,8 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.records import ToneBase
 
-_BELIEVED_CHI2 = (
-    25.0  # 5 σ: if both normals are farther off, attitudes are wrong: the image decides
-)
+# Limit of each χ², 5 σ. If both normals are farther off, the attitudes are wrong: the image decides
+_MOST_CHI2 = 25.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +57,7 @@ class NormalPrior:
 
         If both are farther off, neither is preferred: attitudes are wrong.
         """
-        own, others = (min(self.chi2(each, rotation_cov), _BELIEVED_CHI2) for each in (pose, other))
+        own, others = (min(self.chi2(each, rotation_cov), _MOST_CHI2) for each in (pose, other))
         return others - own
 
 

@@ -89,7 +89,7 @@ def check_code(fit: TargetFit) -> None:
     at_dot, between, sides = _positions_by_code(ring)
     extra = float(excess[between].max(initial=0.0))
     missing = int(np.count_nonzero(excess[at_dot] < -_MISSING_DOT))
-    moved = _largest_displacement(excess, sides)
+    moved = _largest_moved_light(excess, sides)
     if (
         extra > _EXTRA_DOT
         or missing > len(ring.code_deg) // _DOTS_PER_MISSING
@@ -122,7 +122,7 @@ def _positions_by_code(ring: Ring) -> tuple[IndexArray, BoolArray, BoolArray]:
     return distance_deg.argmin(axis=0), between, np.stack((before, after))
 
 
-def _largest_displacement(excess: FloatArray, sides: BoolArray) -> float:
+def _largest_moved_light(excess: FloatArray, sides: BoolArray) -> float:
     """Return the light that is too much on one side of a dot and too little on the other."""
     beside = excess[:, None] * sides
     surplus, deficit = beside.max(axis=1), -beside.min(axis=1)

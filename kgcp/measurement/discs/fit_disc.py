@@ -65,10 +65,8 @@ _SHADOW_CURVE_SD = 0.2
 # point spread. Burnt discs show little of their edges, and would go to 3 and take their blur along.
 _SHARPENINGS = (-0.5, 1.5)
 _FALL = 0.7  # standard deviation of the change of light from a photograph's middle to its end
-_WHITE, _WHITE_SD = (
-    1.0,
-    0.4,
-)  # prior of burnt white with an unknown tone: else the two drift together
+# Prior of burnt white with an unknown tone; without it, the two would drift together
+_WHITE, _WHITE_SD = 1.0, 0.4
 _ALWAYS = (*range(GEOMETRY_COUNT), Row.BLUR_MEAN, Row.BLUR_DIFFERENCE, Row.BLUR_XY)
 _LIGHT = (Row.BLACK, Row.WHITE, Row.SLOPE_X, Row.SLOPE_Y)
 _SLOPES = np.array((Row.SLOPE_X, Row.SLOPE_Y))
@@ -177,7 +175,7 @@ class DiscUnknowns:
         """Return the unknowns of a disc at the edge of a shadow: light of second order.
 
         The darker level gets a gradient of its own, too, whatever the disc's size: a step of the
-        light through the middle of a disc has no second order, and would displace the centre.
+        light through the middle of a disc has odd orders only, and these displace the centre.
         """
         precision = self.precision.copy()
         precision[_UNEVEN, _UNEVEN] = _UNEVEN_PRECISIONS

@@ -194,7 +194,7 @@ def _is_seen(fit: DiscFit) -> BoolArray:
 def _equations(
     fit: DiscFit, sectors: Sequence[Sector], texture: GroundTexture, noise: float
 ) -> FloatArray:
-    """Return the equations (k, p, p + 1) of k sectors: normal matrices, and gradients as last column."""
+    """Return the equations (k, p, p + 1) of k sectors: normal matrices and, last, gradients."""
     rows, by_ground, seen = fit.jacobian[fit.free.rows], _by_ground(fit), _is_seen(fit)
     both = np.vstack((rows, fit.sample.levels - fit.levels)).T
     products = np.zeros((len(sectors), len(rows), len(rows) + 1))
