@@ -27,7 +27,7 @@ _STEPS = 12
 _SETTLED = 1e-9  # largest last step, relative to the distance and in radians
 _LARGEST_TURN_RAD = 0.3  # in one step
 _TURN = np.linspace(0.0, 2.0 * math.pi, 32, endpoint=False)
-_LEAST_TILT_RAD = 0.05  # of a start; at 0 the image does not depend on the tilt
+_LEAST_TILT_RAD = 0.05  # of a start; at 0 the image has no gradient by the tilt
 _ANY_HEADING_RAD2 = math.pi**2 / 3.0  # variance of an unknown angle
 
 
@@ -81,7 +81,7 @@ def pose_towards(centre_m: FloatArray, normal: FloatArray) -> Pose:
 def pose_of_ellipse(camera: Camera, ellipse: Ellipse, radius_m: float) -> Pose:
     """Return one of the two poses of a circle whose image is a given ellipse [raw px].
 
-    It is tilted a little more, so that an adjustment of a circle seen frontally has a gradient.
+    It is tilted by at least 0.05 rad: seen frontally, a circle leaves an adjustment no gradient.
 
     Raises
     ------

@@ -55,7 +55,7 @@ def test_compressed_burnt_plates_are_measured_as_well_as_others(
     assert np.abs(standardised).max() < 3.5
 
 
-def test_white_burnt_in_the_light_hides_nothing(
+def test_burnt_white_in_full_light_is_not_masked(
     photograph: Callable[..., GreyArray],
     start_near: Callable[..., InitialPose],
     monkeypatch: pytest.MonkeyPatch,

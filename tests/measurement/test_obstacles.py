@@ -159,7 +159,7 @@ def test_a_small_patch_over_the_edge_costs_little(
 
 
 @pytest.mark.parametrize("angle_deg", NO_CODE_THERE_DEG)
-def test_a_large_patch_over_the_edge_is_owned_up_to(
+def test_a_large_patch_over_the_edge_is_in_the_deviations(
     measure: Callable[..., list[Outcome]], angle_deg: float
 ) -> None:
     """A fifth of the outline: the fit leans towards the hole, and its deviation says so."""
@@ -168,7 +168,7 @@ def test_a_large_patch_over_the_edge_is_owned_up_to(
 
 
 @pytest.mark.parametrize("quarter", [(1.0, 1.0), (-1.0, -1.0)])
-def test_a_hidden_quarter_is_refused_or_owned_up_to(
+def test_a_hidden_quarter_is_refused_or_in_the_deviations(
     measure: Callable[..., list[Outcome]], quarter: tuple[float, float]
 ) -> None:
     patch = rectangle((0.3 * quarter[0], 0.3 * quarter[1]), 0.6, 0.6), 0.35

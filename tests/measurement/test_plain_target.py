@@ -267,7 +267,7 @@ def test_two_alike_are_ambiguous() -> None:
     assert isinstance(outcome, Measurement)
 
 
-def test_looks_only_where_it_is_told() -> None:
+def test_a_target_is_searched_only_where_it_is_predicted() -> None:
     pose = pose_at(90.4, 71.7)
     grey = frame_with((DISC, pose))
     sure = prediction_of(pose)
@@ -377,7 +377,7 @@ def read_row_by_row(pose: Pose, radius_m: float, rate_rad_s: FloatArray) -> Floa
 
 
 @pytest.mark.parametrize("target", [DISC, RING], ids=["disc", "ring"])
-def test_motion_under_a_rolling_shutter_is_in_the_sigmas(target: PlainTarget) -> None:
+def test_motion_under_a_rolling_shutter_is_in_the_deviations(target: PlainTarget) -> None:
     """Forty of R 20 px: twice as near as others here."""
     rng, radii = np.random.default_rng(6), np.array(target.radii_m)
     cov = 1e-5 * np.diag([1.0, 1.0, 100.0, 100.0, 100.0])

@@ -83,7 +83,7 @@ def test_the_prior_finds_the_right_side_where_the_image_cannot() -> None:
     assert min(other_pose(seen).ambiguity for seen in corrected) > 10.0
 
 
-def test_a_turned_choice_exchanges_the_poses_and_nothing_else() -> None:
+def test_a_reversed_choice_exchanges_the_poses_and_nothing_else() -> None:
     for number in range(5):
         _, grey, before = frame(number)
         after = measure(grey, NormalPrior(other_pose(before).pose.normal, SD_DEG))

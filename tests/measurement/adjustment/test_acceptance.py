@@ -57,7 +57,7 @@ def test_the_target_s_own_code_passes(
 
 
 @pytest.mark.parametrize(("outlying", "is_refused"), [(0.25, False), (0.35, True)])
-def test_a_third_of_outliers_is_no_fit(
+def test_a_fit_with_a_third_of_outliers_is_refused(
     fit_plate: FitPlate, *, outlying: float, is_refused: bool
 ) -> None:
     """Clipped pixels are none, whatever their weight."""
@@ -118,7 +118,9 @@ def test_what_does_not_fit_is_refused(
     assert caught.value.reason is Reason.POOR_FIT
 
 
-def test_a_distance_of_a_per_cent_is_refused(camera: Camera, place_plate: PlacePlate) -> None:
+def test_a_distance_uncertain_by_a_per_cent_is_refused(
+    camera: Camera, place_plate: PlacePlate
+) -> None:
     pose = place_plate((205.4, 190.7), 20.0)
     along = pose.translation_m / pose.distance_m
 

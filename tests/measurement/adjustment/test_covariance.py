@@ -124,7 +124,7 @@ def test_a_pose_is_about_as_well_known_as_its_pixels_allow(fit: TargetFit) -> No
     assert 1.0 <= covariance.inflation < 3.0
 
 
-def test_residuals_that_cancel_within_arcs_make_it_better(fit: TargetFit) -> None:
+def test_residuals_that_cancel_within_arcs_reduce_variances(fit: TargetFit) -> None:
     """Sharpened noise does; but few arcs can agree by chance, and count as if some did not."""
     pixels = np.rint(fit.sample.problem.window.pixels(fit.sample.index)).astype(int)
     score = np.where(pixels.sum(axis=0) % 2, 1.0, -1.0) * np.abs(fit.misfit.score)
@@ -134,7 +134,7 @@ def test_residuals_that_cancel_within_arcs_make_it_better(fit: TargetFit) -> Non
     assert covariance.inflation == 1.0
 
 
-def test_residuals_that_run_along_the_edges_make_it_worse(fit: TargetFit) -> None:
+def test_residuals_correlated_along_edges_enlarge_variances(fit: TargetFit) -> None:
     """The same residuals, constant over each of some stripes: fewer independent ones."""
     x = fit.prediction.points_m[0] * fit.sample.problem.outer_radius_px / 0.45
     stripe = (x // 5.0).astype(int) - int(x.min() // 5.0)
@@ -156,7 +156,7 @@ def with_noisy_edges(fit: TargetFit, sign: FloatArray) -> TargetFit:
 
 
 @pytest.mark.parametrize(("run_px", "least", "most"), [(0.0, 0.4, 1.6), (5.0, 8.0, 60.0)])
-def test_noise_of_edges_is_common_if_it_runs_along_them(
+def test_noise_of_edges_is_common_if_it_is_correlated_along_them(
     fit: TargetFit, run_px: float, least: float, most: float
 ) -> None:
     """Compression's averages out; of a coarse print's, all of an edge may have some in common."""
@@ -173,7 +173,7 @@ def test_noise_of_edges_is_common_if_it_runs_along_them(
 
 
 @pytest.mark.parametrize(("share", "part"), [(0.25, 0.5), (1.0, 1.0)])
-def test_a_quarter_of_what_runs_along_an_edge_is_common(
+def test_a_quarter_of_noise_correlated_along_an_edge_is_common(
     fit: TargetFit, share: float, part: float
 ) -> None:
     sign = np.random.default_rng(5).choice((-1.0, 1.0), len(fit.sd))

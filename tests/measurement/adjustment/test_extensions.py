@@ -181,7 +181,7 @@ def test_a_fit_with_an_implausible_curve_gives_way_to_the_other_base(
         (0.3, 1.4, 10.0, 1, False),
     ],
 )
-def test_cells_ask_for_levels_and_edges_where_cells_leave_a_doubt(
+def test_levels_vary_by_cells_or_by_edges_where_cells_are_doubtful(
     monkeypatch: pytest.MonkeyPatch,
     *,
     excess: float,
@@ -208,7 +208,7 @@ def test_cells_ask_for_levels_and_edges_where_cells_leave_a_doubt(
         (12.6, 8.9, False),
     ],
 )
-def test_small_rings_are_in_even_light_where_levels_explain_little_more(
+def test_small_rings_keep_even_light_if_levels_that_vary_gain_little(
     monkeypatch: pytest.MonkeyPatch, *, radius_px: float, advantage: float, is_even: bool
 ) -> None:
     problem = stand_in(is_ring_small=radius_px < 12.5, may_be_finer=False, tone=Tone.LINEAR)
@@ -316,7 +316,7 @@ def test_levels_over_a_second_base_start_from_those_over_the_first(
         (Tone.LINEAR, 2, {Param.EDGE_TONE: 101.0}, []),  # nothing is processed
     ],
 )
-def test_edges_have_a_tone_of_their_own_beside_levels_if_residuals_ask_for_it(
+def test_edges_have_a_tone_of_their_own_beside_levels_if_its_score_test_says_so(
     monkeypatch: pytest.MonkeyPatch,
     tone: Tone,
     clipped: int,

@@ -59,7 +59,7 @@ def problem() -> Problem:
     return Problem(equations, misfit, dense, np.append(of_others, of_levels), values)
 
 
-def test_the_covariance_of_all_else_is_that_of_dense_equations(problem: Problem) -> None:
+def test_the_covariance_of_other_parameters_is_that_of_dense_equations(problem: Problem) -> None:
     expected = np.linalg.inv(problem.normal)
     inverse = np.linalg.inv(problem.equations.normal)
     assert np.allclose(inverse, expected[:OTHERS, :OTHERS], rtol=1e-9)
@@ -80,7 +80,7 @@ def test_a_step_is_that_of_dense_equations(problem: Problem) -> None:
     assert not values[:, FIRST_UNUSED:].any()
 
 
-def test_what_levels_take_over_is_their_projection(problem: Problem) -> None:
+def test_the_part_that_levels_explain_is_their_projection(problem: Problem) -> None:
     equations, weight = problem.equations, problem.misfit.weight
     of_levels = problem.dense[:, OTHERS:][:, equations.used]
     own = (of_levels * weight[:, None]).T @ of_levels + np.diag(equations.precision)

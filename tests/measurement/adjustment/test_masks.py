@@ -126,7 +126,7 @@ def test_the_reach_of_a_blur_is_its_ellipse(blur: tuple[float, float, float]) ->
         (0.45, 0.75, 0.0),  # all ink, which is most of the ring: the light is wrong
     ],
 )
-def test_what_would_hide_most_of_a_plate_is_another_light(
+def test_a_mask_of_most_of_the_plate_is_dropped(
     target: Target,
     camera: Camera,
     place_plate: Callable[..., Pose],

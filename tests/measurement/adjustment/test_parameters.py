@@ -27,7 +27,9 @@ def stepped(**steps: float) -> Blur:
 @pytest.mark.parametrize(
     ("elongation", "is_kept"), [(0.0, True), (0.4, True), (0.47, True), (0.5, False), (5.0, False)]
 )
-def test_a_blur_is_never_narrower_than_nothing(elongation: float, *, is_kept: bool) -> None:
+def test_the_covariance_of_a_blur_stays_positive_definite(
+    elongation: float, *, is_kept: bool
+) -> None:
     blur = stepped(BLUR_DIFFERENCE=elongation * math.cos(TURN), BLUR_XY=elongation * math.sin(TURN))
     covariance = np.array([[blur.xx, blur.xy], [blur.xy, blur.yy]])
     least, most = np.linalg.eigvalsh(covariance)

@@ -62,7 +62,7 @@ def beyond_px(sample: Sample, pose: Pose) -> FloatArray:
 @pytest.mark.parametrize("ground", [0.05, 0.35])
 @pytest.mark.parametrize("corners", [4, 5, 8])
 @pytest.mark.parametrize("radius_px", [14.0, 40.0])
-def test_what_mixes_with_the_surroundings_is_left_out(
+def test_pixels_mixed_with_the_surroundings_are_left_out(
     target: Target,
     camera: Camera,
     place_plate: PlacePlate,
@@ -119,7 +119,7 @@ def test_where_a_streak_carries_the_surroundings_to_the_ring_nothing_is_used(
     assert len(sample.levels) > 0.6 * len(everything.levels)
 
 
-def test_surroundings_as_bright_as_the_plate_are_no_loss(
+def test_surroundings_as_bright_as_the_plate_are_not_masked(
     target: Target, camera: Camera, place_plate: PlacePlate, imaging_of: ImagingOf
 ) -> None:
     pose = place_plate((205.4, 190.7), 20.0, turn_deg=31.0)
@@ -130,7 +130,7 @@ def test_surroundings_as_bright_as_the_plate_are_no_loss(
 
 
 @pytest.mark.parametrize(("near_sigmas", "within_sigmas"), [(NEAR_SIGMAS, 1.5), (3.3, 3.0)])
-def test_all_that_says_where_edges_are_is_used(
+def test_all_pixels_near_edges_are_used(
     target: Target,
     camera: Camera,
     place_plate: PlacePlate,
@@ -166,7 +166,7 @@ def test_a_target_outside_its_window_has_lost_its_edges(
     assert caught.value.reason is Reason.EDGES_LOST
 
 
-def test_sharpening_feels_the_far_tails_of_edges(
+def test_sharpening_depends_on_the_far_tails_of_edges(
     target: Target, camera: Camera, place_plate: PlacePlate, imaging_of: ImagingOf
 ) -> None:
     """They take no part themselves. Against the whole window, exposed and sharpened by OpenCV."""

@@ -59,7 +59,7 @@ def test_even_light_is_even(
     assert shadows_across(problem, plateaus) == []
 
 
-def test_where_no_ink_or_plate_is_seen_the_levels_are_those_of_what_is_farther_off(
+def test_levels_are_those_farther_off_where_no_plateau_is_near(
     look: Callable[..., tuple[FitProblem, Plateaus]],
     target: Target,
     place_plate: Callable[..., Pose],
@@ -150,7 +150,7 @@ def test_ink_under_glare_is_ink(
     assert 0.2 < np.mean(problem.window.pixels(ink)[0] > glare_px + 5.0) < 0.4
 
 
-def test_dots_of_another_code_are_not_light(
+def test_dots_of_another_code_are_not_taken_for_uneven_light(
     look: Callable[..., tuple[FitProblem, Plateaus]], target: Target
 ) -> None:
     more = replace(target.ring, code_deg=(*target.ring.code_deg, 230.0))

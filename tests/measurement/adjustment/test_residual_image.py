@@ -28,7 +28,7 @@ def pose(place_plate: PlacePlate) -> Pose:
 
 
 @pytest.mark.parametrize("response", [Response.LINEAR, Response.UNKNOWN])
-def test_the_right_pose_leaves_noise(
+def test_the_right_pose_leaves_only_noise(
     camera: Camera, target: Target, draw_frame: DrawFrame, pose: Pose, response: Response
 ) -> None:
     grey = draw_frame((target, pose), noise=NOISE)
@@ -41,7 +41,7 @@ def test_the_right_pose_leaves_noise(
     assert left.edge_noise < 0.05
 
 
-def test_a_pose_too_near_or_beside_shows_where(
+def test_residuals_show_where_a_pose_is_too_near_or_beside(
     camera: Camera, target: Target, draw_frame: DrawFrame, pose: Pose
 ) -> None:
     """Model less frame: a plate taken for too far left has ink where the frame is white."""

@@ -69,7 +69,7 @@ def percent_off(measurement: Measurement, truth: Pose) -> float:
     return 100.0 * (measurement.distance_m / truth.distance_m - 1.0)
 
 
-def test_it_is_seen_and_what_all_frames_say_makes_distances_right(
+def test_smoothing_is_seen_and_that_of_all_frames_corrects_distances(
     smoothed: list[tuple[Measurement, Pose]],
 ) -> None:
     seen = [smoothing_of(measurement) for measurement, _ in smoothed]
@@ -84,7 +84,7 @@ def test_it_is_seen_and_what_all_frames_say_makes_distances_right(
     assert abs(np.mean(with_it)) < 0.03
 
 
-def test_a_measurement_can_be_told_again_and_again(
+def test_a_measurement_can_be_corrected_repeatedly(
     smoothed: list[tuple[Measurement, Pose]],
 ) -> None:
     first, _ = smoothed[0]
@@ -103,7 +103,7 @@ def test_a_measurement_can_be_told_again_and_again(
     assert with_smoothing(CAMERA, known, surely) is known
 
 
-def test_values_of_single_frames_are_as_good_as_stated() -> None:
+def test_smoothing_of_single_frames_is_as_good_as_stated() -> None:
     rng = np.random.default_rng(3)
     sigmas: list[FloatArray] = []
     for _ in range(100):

@@ -57,7 +57,7 @@ def test_a_streak_is_read_from_the_gaussian_that_fits_its_edges(
 
 
 @pytest.mark.parametrize(("growth_px", "rounds"), [(0.005, 1), (0.6, 2)])
-def test_pixels_are_chosen_anew_for_what_moves_in_the_image_alone(
+def test_pixels_are_chosen_anew_only_if_the_target_moves_in_the_image(
     photograph: Callable[..., GreyArray],
     imaging_of: Callable[..., FitProblem],
     monkeypatch: pytest.MonkeyPatch,

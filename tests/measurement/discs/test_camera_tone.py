@@ -119,7 +119,7 @@ def light_of(levels: tuple[float, float], gradient: float, number: int) -> Float
     return field_irradiance(camera, POSE, scene, Optics(0.6))
 
 
-def test_no_pixels_are_not_burnt() -> None:
+def test_the_clipped_share_of_no_pixels_is_0() -> None:
     """All of a window may be foreign: a mean of them would warn on stderr."""
     none, both = np.zeros(0, np.bool_), np.array([True, False])
     assert Censoring(0.998, 0.002, none, none).share == 0.0
@@ -138,7 +138,7 @@ def test_no_pixels_are_not_burnt() -> None:
         (Sensor(tone=ToneCurve.FILM), Response.UNKNOWN, 92),
     ],
 )
-def test_what_displaces_edges_is_known_of_the_camera(
+def test_an_unknown_curve_and_compression_are_recorded(
     sensor: Sensor, response: Response, quality: int
 ) -> None:
     discs = small_discs(sensor, (0.62, 0.1), 0.004, 0, quality)
@@ -147,7 +147,7 @@ def test_what_displaces_edges_is_known_of_the_camera(
     assert learned.is_compressed == (quality > 0)
 
 
-def test_what_is_usual_of_burnt_white_does_not_bend_the_curve() -> None:
+def test_the_prior_of_burnt_white_does_not_bend_the_curve() -> None:
     """Said by each disc, it did: first wave −0.19."""
     tasks = small_discs(Sensor(tone=ToneCurve.FILM), (0.62, 0.1), 0.004, 0)
     learned = learn_tone(tasks, Response.UNKNOWN)

@@ -233,7 +233,7 @@ def test_steps_beyond_a_limit_of_the_curve_gain_most_along_it() -> None:
         assert (rows @ (now + made)[:3] - least).min() > -1e-9
 
 
-def test_a_step_that_is_no_number_is_no_fit() -> None:
+def test_a_step_that_is_not_finite_is_refused() -> None:
     with pytest.raises(NoFit):
         within_limits(np.full(4, np.nan), np.eye(4), np.zeros(4), Tone.UNKNOWN)
 

@@ -48,7 +48,7 @@ def alone(ratio: float) -> float:
     return float(inflations([scatter(ratio)])[0])
 
 
-def test_a_third_is_left_of_what_chance_makes_of_no_excess() -> None:
+def test_of_an_excess_by_chance_a_third_is_left() -> None:
     chance = np.random.default_rng(3).normal(0.0, 0.3, 20_000)
     left = beyond_chance(chance, np.full(len(chance), 0.09))
     assert left.mean() / 0.3 == pytest.approx(0.13, abs=0.01)
@@ -133,7 +133,7 @@ def test_jpegs_blocks_show_how_much_of_its_errors_cancels() -> None:
     assert np.mean(aside) > 1.05 * np.mean(stated)  # blocks that begin elsewhere show less of it
 
 
-def test_deviations_of_discs_of_which_little_is_seen_are_true() -> None:
+def test_deviations_of_mostly_clipped_discs_are_true() -> None:
     """Small dark discs on burnt ground: twelve unknowns from some twenty pixels."""
     camera, pose = Camera(110, 70, 2e5, 2e5, 54.5, 34.5), Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
     lattice = 20.0 * np.array([(i, j) for i in range(-2, 3) for j in (-1, 0, 1)])
@@ -172,7 +172,7 @@ def test_only_edges_tell_the_noise_of_a_burnt_disc(*, gain: float, is_burnt: boo
         assert fit.noise_freedom == fit.redundancy
 
 
-def test_a_disc_of_which_too_little_is_seen_is_refused() -> None:
+def test_a_disc_with_too_few_unclipped_pixels_is_refused() -> None:
     camera, pose = Camera(40, 40, 2e5, 2e5, 19.5, 19.5), Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
     scene = FieldScene((SimulatedDisc((1.5e-6, 1e-6, 0.0), 6.0 / 2e5),), 0.62, 0.1)
     optics, rng = Optics(0.6), np.random.default_rng(8)

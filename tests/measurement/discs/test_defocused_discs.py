@@ -95,7 +95,7 @@ def test_a_camera_in_focus_has_no_kurtosis(response: Response) -> None:
     assert abs(errors.mean()) < 0.01
 
 
-def test_derivatives_by_a_shift_know_of_the_kurtosis() -> None:
+def test_derivatives_by_a_shift_contain_the_kurtosis() -> None:
     x, y = np.meshgrid(np.arange(24.0), np.arange(24.0))
     places, blur = np.vstack((x.ravel(), y.ravel())), Blur(1.4, 1.2, 0.1)
     geometry = np.array((11.3, 12.1, 6.2, 0.4, 5.1))

@@ -39,7 +39,7 @@ def levels(tone: Tone, values: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 @pytest.mark.parametrize("tone", [Tone.LINEAR, Tone.SRGB, Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE])
-def test_derivatives_contain_what_beside_the_pixels_changes(tone: Tone) -> None:
+def test_derivatives_contain_changes_of_sharpened_neighbours(tone: Tone) -> None:
     """Pixels that are not modelled are in the mask, and depend on light and tone as well."""
     _, jacobian = levels(tone, vector())
     for row in LEVEL_ROWS:
@@ -75,7 +75,7 @@ def test_curves_rise_everywhere() -> None:
 
 
 @pytest.mark.parametrize("tone", [Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE])
-def test_curves_darken_no_darks(tone: Tone) -> None:
+def test_curves_do_not_make_darks_darker(tone: Tone) -> None:
     """Than a straight line, by more than an error of the black level; steep curves can."""
     waves = np.array((-1.04, 0.63, -0.25) if tone.is_srgb else (-0.6, 0.0, 0.0))
     light = np.linspace(0.02, 0.4, 39)

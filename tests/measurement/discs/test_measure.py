@@ -394,7 +394,7 @@ def test_light_beyond_the_second_order_counts_as_an_error(monkeypatch: pytest.Mo
     assert 1.1 < sd_px / rms_and_sd_px(photo, truth)[1] < 1.5
 
 
-def test_little_of_an_uneven_light_is_enough_to_be_estimated(
+def test_curved_light_is_estimated_from_a_small_chi2_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     photo, truth = under_shadows(0.3, 12.0, 0.0)
