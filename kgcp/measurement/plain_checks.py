@@ -52,7 +52,7 @@ def check_edge(disc: Disc) -> None:
     """
     beyond_noise_px = disc.sd_px * math.sqrt(max(0.0, 1.0 - 1.0 / disc.inflation))
     if beyond_noise_px > math.hypot(_ROUGH_PX, _EDGE * disc.ellipse.mean_radius):
-        detail = f"an uneven edge, which leaves the centre open by {beyond_noise_px:.2f} px"
+        detail = f"an uneven edge, so that the centre is uncertain by {beyond_noise_px:.2f} px"
         raise Rejection(Reason.POOR_FIT, detail)
     if disc.blur_px > _MOST_BLUR * disc.ellipse.b:
         size = f"semi-axes of {disc.ellipse.a:.1f} and {disc.ellipse.b:.1f} px"
@@ -70,7 +70,7 @@ def _check_size(target: PlainTarget, prediction: PlainPrediction, pose: Pose) ->
         target.sd_diameter_m / target.outer_diameter_m,
     )
     if abs(off) > SIGMAS * sd:
-        raise Rejection(Reason.UNLIKE_PREDICTION, f"{math.exp(-off) - 1.0:+.0%} in size")
+        raise Rejection(Reason.UNLIKE_PREDICTION, f"its size is off by {math.exp(-off) - 1.0:+.0%}")
 
 
 def check_agreement(

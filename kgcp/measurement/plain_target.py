@@ -135,7 +135,7 @@ def _check_prediction(camera: Camera, target: PlainTarget, prediction: PlainPred
     if prediction.is_from_behind():
         raise Rejection(Reason.OUT_OF_VIEW, f"{prediction}, seen from behind")
     if not prediction.is_sure:
-        raise Rejection(Reason.NO_PREDICTION, f"{prediction}: not sure enough to look there")
+        raise Rejection(Reason.NO_PREDICTION, f"{prediction}: too uncertain to search there")
     smallest_px = smallest_radius_px(target)
     if prediction.radius_px < smallest_px:
         raise Rejection(Reason.TOO_SMALL, f"{prediction}, below {smallest_px:g} px")
@@ -164,13 +164,13 @@ def _only_candidate(
             first_refusal = first_refusal or (rejection.reason, rejection.detail)
     if accepted and len(edges) > _MOST_TRIES:
         raise Rejection(
-            Reason.AMBIGUOUS_PLACE, f"{len(edges)} edges of its size and shape; {prediction}"
+            Reason.AMBIGUOUS_PLACE, f"{len(edges)} edges have its size and shape; {prediction}"
         )
     if len(accepted) > 1:
         places = " and ".join(
             f"({each.circles.discs[0].x:.0f}, {each.circles.discs[0].y:.0f})" for each in accepted
         )
-        raise Rejection(Reason.AMBIGUOUS_PLACE, f"alike at {places}; {prediction}")
+        raise Rejection(Reason.AMBIGUOUS_PLACE, f"edges like its own at {places}; {prediction}")
     if accepted:
         return accepted[0]
     if first_refusal is not None:
@@ -248,7 +248,7 @@ def _measured_on_texture(
     try:
         return _checked(camera, target, prediction, candidate.fit.pose, circles)
     except Rejection as rejection:
-        detail = f"{rejection.detail}, by the texture of its ground; {prediction}"
+        detail = f"{rejection.detail}, measured with the texture of its ground; {prediction}"
         raise Rejection(rejection.reason, detail) from None
 
 
@@ -336,7 +336,7 @@ def _measured_circles(
     reach_px = max(_INNER_REACH * edge.ellipse.mean_radius, _LEAST_INNER_REACH_PX)
     for followed in follow_outlines(grey, inner, reach_px):
         if followed is None:
-            raise Rejection(Reason.UNLIKE_PREDICTION, "its inner circle is not there")
+            raise Rejection(Reason.UNLIKE_PREDICTION, "its inner circle is missing")
         outlines.append(followed)
     border = _border(camera, target, start)
     discs: list[Disc] = []

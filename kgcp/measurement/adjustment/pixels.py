@@ -108,7 +108,7 @@ def select_pixels(
     if most is not None and is_sparse:
         index = index[_GOLDEN * np.arange(len(index)) % 1.0 < most / len(index)]
     if len(index) < 4 * PLAIN_COUNT:
-        raise Rejection(Reason.EDGES_LOST, f"{len(index)} pixels of the target")
+        raise Rejection(Reason.EDGES_LOST, f"only {len(index)} usable pixels of the target")
     is_thinned = is_sparse and max_pixels is not None
     return _sample(seen, pose, light, index, is_thinned=is_thinned, is_sparse=is_sparse)
 

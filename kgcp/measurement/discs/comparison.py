@@ -123,7 +123,7 @@ def measure_by_gaussian(task: DiscTask) -> Disc | DiscMiss:
     moments = 0.25 * np.array((xx * xx + xy * xy, xy * (xx + yy), xy * xy + yy * yy))
     vector = np.array((x, y, *moments))
     if not 0.5 < ellipse_of_moments(vector).mean_radius / radius_px < 2.0:
-        return DiscMiss(task.outline, DiscReason.POOR_FIT, "another size than its outline")
+        return DiscMiss(task.outline, DiscReason.POOR_FIT, "its size is not that of its outline")
     to_moments = moments_by_stretch(solution.x[:5])
     return Disc(
         outline=task.outline,

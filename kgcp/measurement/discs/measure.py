@@ -184,7 +184,7 @@ def _with_ring_unknowns(fit: DiscFit) -> tuple[DiscFit, DiscScatter]:
     """
     unknowns, scatter = RingUnknowns.of(fit), scatter_of(fit)
     if not unknowns.is_seen:
-        detail = f"an inner circle is not there, or steps by {unknowns.ratio:.0%} of the outer one"
+        detail = f"inner circles missing, or of {unknowns.ratio:.0%} of the outer one's contrast"
         raise DiscRejection(DiscReason.POOR_FIT, detail)
     to_moments = moments_by_stretch(fit.state.geometry)
     common = scatter.common + to_moments @ unknowns.cov @ to_moments.T
