@@ -131,7 +131,7 @@ def test_a_far_ring_is_measured_as_a_whole() -> None:
         outcome = looked(grey, expected, target)
         assert isinstance(outcome, Measurement) is (ratio == 0.9)
         if isinstance(outcome, Miss):
-            assert re.search(r"steps by (6|7)\d% of the outer one", outcome.detail)
+            assert re.search(r"of (6|7)\d% of the outer one", outcome.detail)
     assert isinstance(outcome, Measurement)
     assert outcome.uncertainty is not None
     off_m = outcome.distance_m - pose.distance_m
