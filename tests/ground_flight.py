@@ -13,7 +13,7 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, opk_from_rotation
 from kgcp.geometry.camera import Camera
-from kgcp.geometry.circle_image import Circles3D, circle_slopes
+from kgcp.geometry.circle_image import Circles3D, circle_derivatives
 from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.io.tables.detections import DETECTION_COLUMNS
@@ -88,7 +88,7 @@ class GroundFlight:
         circle = Circles3D(
             pose.translation_m[None], pose.rotation[None, :, :2], np.array([radius_m])
         )
-        slopes = circle_slopes(CAMERA, circle)
+        slopes = circle_derivatives(CAMERA, circle)
         by_pose = np.concatenate((slopes.by_centre[0], slopes.by_rotation[0]), axis=1)
         moments = np.array([[0.0, 0.0, *([(0.25 * (CAMERA.fx * radius_m / 30.0) ** 2)] * 3)]])
         moments[0, 3] = 0.0

@@ -1,12 +1,12 @@
-"""Loops over pixels, compiled to machine code when they are first used.
+"""Decorators that compile loops over pixels to machine code (numba), at the first call.
 
-The compiled code is kept beside the source, or in the user's cache folder where that cannot be
-written, and found again by later runs. It is found by the source file of the function alone: so
-compiled functions call only compiled functions of their own file.
+numba caches the compiled code beside the source file, or in the user's cache folder if that cannot
+be written. Later runs load it from there. The cache notices changes of the function's own source
+file only. Therefore a compiled function may call compiled functions of its own file, but no others.
 
-A function is handed to numba at its first call. A process that compiles nothing does not load
-numba, and one that uses few functions does not ask for each of the others where its compiled code
-may be kept: together half a second of a process.
+Functions are handed to numba at their first call, not at import. A process that calls none of them
+does not load numba. A process that calls a few does not look up cache files for all the others.
+Together this saves half a second per process.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from kgcp.errors import KgcpError
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
-_FOR_READING = 0, 3, 1  # LLVM's prefetch: to read, into the nearest cache, of data
-# So many calls by Python take as long as loading numba and its tables: 0.5 s.
+_PREFETCH_ARGUMENTS = 0, 3, 1  # of llvm.prefetch: read access, keep in all cache levels, data cache
+# Interpreting this many calls takes as long as loading numba and the cached code: 0.5 s.
 _CALLS_BEFORE_COMPILING = 100_000
 
 
 class _Compilable:
-    """A function that is compiled, or found compiled, when it is first called.
+    """A function that is compiled, or loaded from the cache, when it is first called.
 
     Parameters
     ----------
     options
-        Of `numba.njit`, beyond those of all functions.
+        For `numba.njit`, in addition to those that all functions have.
     """
 
     def __init__(self, function: Callable[..., Any], **options: Any) -> None:  # noqa: ANN401 - numba's
@@ -42,24 +42,25 @@ class _Compilable:
         update_wrapper(self, function)
 
     def __call__(self, *args: Any) -> Any:  # noqa: ANN401 - those of the function
-        """Call the compiled function, and compile it if this is the first call."""
+        """Call the compiled function; compile it first if necessary."""
         dispatcher = self._dispatcher or self.dispatcher()
         return dispatcher(*args)
 
     def interpreted(self, *args: Any) -> Any:  # noqa: ANN401 - those of the function
-        """Call the function as Python runs it, with numpy's division by zero."""
+        """Call the plain Python function; division by zero gives inf or NaN without a warning."""
         with np.errstate(all="ignore"):
             return self._function(*args)
 
     def dispatcher(self) -> Callable[..., Any]:
-        """Return numba's dispatcher of the function, which replaces this one in its module.
+        """Return numba's dispatcher, and put it in this object's place in the function's module.
 
-        Those that the function calls come first: numba looks for them under their names.
+        The compilable functions that this one calls are replaced first, because numba looks them up
+        by name in the module.
 
         Raises
         ------
         KgcpError
-            If there is no folder in which compiled code could be kept.
+            If there is no writable folder for the compiled code.
         """
         if self._dispatcher is None:
             import numba
@@ -71,7 +72,7 @@ class _Compilable:
                     function.__globals__[name] = called.dispatcher()
             try:
                 made = numba.njit(cache=True, error_model="numpy", **self._options)(function)
-            except RuntimeError as error:  # numba's own, where no folder is left
+            except RuntimeError as error:  # numba found no writable cache folder
                 raise KgcpError(
                     f"compiled code cannot be stored in any folder ({error}); set the environment"
                     " variable NUMBA_CACHE_DIR to a folder that can be written"
@@ -81,26 +82,27 @@ class _Compilable:
 
 
 class _CompiledIfOften(_Compilable):
-    """A function that Python runs until numba is loaded, or there are many calls."""
+    """A function that is interpreted until numba is loaded anyway, or until it is called often."""
 
-    calls_left = _CALLS_BEFORE_COMPILING  # of all such functions together
+    calls_left = _CALLS_BEFORE_COMPILING  # shared by all such functions
 
     def __call__(self, *args: Any) -> Any:  # noqa: ANN401 - those of the function
-        """Call the function as Python runs it, or compiled once there were many calls."""
+        """Call the interpreted or the compiled function."""
         if _CompiledIfOften.calls_left > 0 and "numba" not in sys.modules:
             _CompiledIfOften.calls_left -= 1
             return self.interpreted(*args)
         return super().__call__(*args)
 
 
-class _Hint(_Compilable):
-    """A function (array, index) that does nothing but ask the processor to load that entry.
+class _PrefetchIntrinsic(_Compilable):
+    """A function (array, index) that numba translates to the processor's prefetch instruction.
 
-    Compiled functions of any file may call it, since it changes no result.
+    Compiled functions of any file may call it, because it does not change results: a stale cache
+    does no harm.
     """
 
     def dispatcher(self) -> Callable[..., Any]:
-        """Return the function itself, which numba now knows as the processor's instruction."""
+        """Register the function as an intrinsic with numba, and return it unchanged."""
         if self._dispatcher is None:
             from llvmlite import ir
             from numba import types
@@ -108,7 +110,7 @@ class _Hint(_Compilable):
 
             number, pointer = ir.IntType(32), ir.IntType(8).as_pointer()
 
-            # numba hands over objects of its own, for which it has no annotations
+            # numba passes objects of its own, which have no annotations
             def returned(_: Any) -> Any:  # noqa: ANN401
                 return lambda _array, _index: types.void
 
@@ -118,7 +120,7 @@ class _Hint(_Compilable):
                 place = builder.bitcast(builder.gep(data, [values[1]]), pointer)
                 kind = ir.FunctionType(ir.VoidType(), [pointer, number, number, number])
                 hint = builder.module.declare_intrinsic("llvm.prefetch", [pointer], kind)
-                builder.call(hint, [place, *map(number, _FOR_READING)])
+                builder.call(hint, [place, *map(number, _PREFETCH_ARGUMENTS)])
                 return context.get_dummy_value()
 
             type_callable(self._function)(returned)
@@ -128,46 +130,48 @@ class _Hint(_Compilable):
 
 
 def compiled(function: _Function) -> _Function:
-    """Compile a function of numbers and arrays; division by zero gives inf or NaN as in numpy."""
+    """Compile a function of numbers and arrays; division by zero gives inf or NaN, as in numpy."""
     return cast("_Function", _Compilable(function))
 
 
 def compiled_if_often(function: _Function) -> _Function:
-    """Compile as `compiled`, unless the whole process calls such functions a few times only.
+    """Compile as `compiled`, but only if the process makes many calls of such functions.
 
-    Sums, differences, products and quotients alone: of these, Python makes the same bits.
+    Only for functions that add, subtract, multiply and divide: interpreted and compiled code then
+    give the same bits.
     """
     return cast("_Function", _CompiledIfOften(function))
 
 
 def interpreted(function: _Function) -> _Function:
-    """Return a compiled function as Python runs it, for calls too few to load numba for."""
+    """Return the plain Python function of a compiled one, for calls too few to load numba."""
     return cast("_Function", cast("_Compilable", function).interpreted)
 
 
 def summed(function: _Function) -> _Function:
-    """Compile as `compiled`; sums may be reordered so that vector units take several terms."""
+    """Compile as `compiled`, and let the compiler reorder sums to vectorise them."""
     return cast("_Function", _Compilable(function, fastmath={"contract", "reassoc"}))
 
 
 def inlined(function: _Function) -> _Function:
-    """Compile a function into those that call it, which leave out what they do not use."""
+    """Compile a function into its callers, where results that are not used cost nothing."""
     return cast("_Function", _Compilable(function, forceinline=True))
 
 
 def fused(function: _Function) -> _Function:
-    """Compile as `inlined`; a · b + c may be one step with one rounding, if the processor has it.
+    """Compile as `inlined`; a · b + c may become a fused multiply-add, which rounds only once.
 
-    Where, is up to the compiler. So what calls such a function is to be called by Python alone: of
-    a function that others call there may be two versions, and which one they get depends on what a
-    process has compiled itself and what it has found compiled.
+    The compiler decides where it fuses. So a function that calls a fused one must be called from
+    Python only. If compiled functions called it, there could be two versions of it that round
+    differently. Which one they get would depend on what the process compiled itself and what it
+    loaded from the cache.
     """
     return cast("_Function", _Compilable(function, forceinline=True, fastmath={"contract"}))
 
 
-@_Hint
+@_PrefetchIntrinsic
 def prefetch(array: np.ndarray[Any, Any], index: int) -> None:
-    """Have the processor load an entry of a contiguous array into its cache, without waiting.
+    """Start to load an entry of a contiguous array into the cache, without waiting for it.
 
-    For loops over places whose distances it cannot foresee. The index need not be in the array.
+    For loops whose memory accesses the processor cannot predict. The index may be out of range.
     """

@@ -1,4 +1,4 @@
-"""Attitudes and their covariances; reference poses of the camera as an adjustment gives them."""
+"""Attitudes and their covariances, and the camera's reference poses from a bundle adjustment."""
 
 from __future__ import annotations
 
@@ -9,44 +9,46 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 
 CAMERA_FROM_PHOTO: FloatArray = np.diag([1.0, -1.0, -1.0])
-"""From x right, y up, z backward (photogrammetry) to x right, y down, z forward (kgcp)."""
+"""From camera axes of photogrammetry (x right, y up, z backward) to kgcp's (right, down,
+forward)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReferencePoses:
     """Exterior orientations of n frames."""
 
-    # names as in the detections: relative to the frames folder, with /; unique
+    # unique names as in the detections: relative to the frames folder, with / as separator
     frames: tuple[str, ...]
     position_map: FloatArray  # (n, 3): projection centres x, y, z in the flight's CRS
     opk_deg: FloatArray  # (n, 3): omega, phi, kappa relative to the map's axes [deg]
-    # (n, 3): standard deviations along the map's axes [m]; None: not given
+    # (n, 3): standard deviations along the map's axes [m]; None if not given
     sd_position_m: FloatArray | None
-    sd_angle_deg: FloatArray | None  # (n,): of each of the three angles [deg]; None: not given
+    # (n,): standard deviation of each of the three angles [deg]; None if not given
+    sd_angle_deg: FloatArray | None
 
 
 def rotation_from_opk(opk_deg: FloatArray) -> FloatArray:
-    """Return map ← camera rotations (n, 3, 3) from omega, phi, kappa (n, 3) [deg].
+    """Return rotations (n, 3, 3) camera → map from omega, phi, kappa (n, 3) [deg].
 
-    R = Rx(ω) Ry(φ) Rz(κ); its camera axes are x right, y up, z backward (docs/conventions.md).
+    R = Rx(ω) Ry(φ) Rz(κ), for camera axes x right, y up, z backward (docs/conventions.md).
     """
-    from scipy.spatial.transform import Rotation  # 0.2 s that workers do not need
+    from scipy.spatial.transform import Rotation  # here, since workers need not load it: 0.2 s
 
     return np.asarray(Rotation.from_euler("XYZ", opk_deg, degrees=True).as_matrix())
 
 
 def opk_from_rotation(map_from_photo: FloatArray) -> FloatArray:
-    """Return omega, phi, kappa (n, 3) [deg] of rotations (n, 3, 3); undoes `rotation_from_opk`."""
+    """Return omega, phi, kappa (n, 3) [deg] of rotations (n, 3, 3): inverts `rotation_from_opk`."""
     from scipy.spatial.transform import Rotation  # as above
 
     return np.asarray(Rotation.from_matrix(map_from_photo).as_euler("XYZ", degrees=True))
 
 
 def rotation_onto(points: FloatArray, others: FloatArray) -> FloatArray:
-    """Return the rotation R (3, 3) by which `points @ R.T` comes nearest to `others`, both (n, 3).
+    """Return the rotation R (3, 3) that brings `points @ R.T` closest to `others`, both (n, 3).
 
-    Both about their means, by least squares, never a mirror image (Kabsch, Acta Crystallographica
-    A32, 1976). Of points in a line, it is one of many.
+    Least squares about both means, without reflections (Kabsch, Acta Crystallographica A32, 1976).
+    If the points are collinear, the rotation is not unique and one of them is returned.
     """
     before, after = points - points.mean(axis=0), others - others.mean(axis=0)
     left, _, right = np.linalg.svd(after.T @ before)
@@ -55,20 +57,20 @@ def rotation_onto(points: FloatArray, others: FloatArray) -> FloatArray:
 
 
 def down_in_camera(opk_deg: FloatArray) -> FloatArray:
-    """Return the vertical (n, 3), downwards, in the camera frame, from omega, phi, kappa (n, 3).
+    """Return the downward vertical (n, 3) in the camera frame, from omega, phi, kappa (n, 3).
 
-    The third axis of every map is the local vertical, whichever way its grid is turned: neither
-    the meridian convergence nor the CRS matters.
+    The third axis of every map frame is the local vertical. So meridian convergence and CRS do not
+    matter.
     """
     photo_from_map = np.swapaxes(rotation_from_opk(opk_deg), 1, 2)
     return np.asarray(-photo_from_map[:, :, 2] @ CAMERA_FROM_PHOTO.T)
 
 
 def attitude_axes(frame_from_body: FloatArray, down: FloatArray) -> FloatArray:
-    """Return the axes (n, 3, 3) about which roll, pitch and heading turn a body, as columns.
+    """Return the axes (n, 3, 3) of roll, pitch and heading of a body, as columns.
 
-    Roll turns about the body's x, heading about the vertical `down` (n, 3), pitch about the
-    horizontal axis that is square to both.
+    Roll turns about the body's x axis and heading about the vertical `down` (n, 3). Pitch turns
+    about the horizontal axis perpendicular to both.
     """
     forward = frame_from_body[:, :, 0]
     right = np.cross(down, forward)
@@ -77,13 +79,13 @@ def attitude_axes(frame_from_body: FloatArray, down: FloatArray) -> FloatArray:
 
 
 def covariance_along(axes: FloatArray, sd: FloatArray) -> FloatArray:
-    """Return A diag(σ²) Aᵀ (..., m, m) for axes A (..., m, n), as columns, and σ (..., n)."""
+    """Return A diag(σ²) Aᵀ (..., m, m) for axes A (..., m, n) as columns and σ (..., n)."""
     scaled = axes * sd[..., None, :]
     return np.asarray(scaled @ np.swapaxes(scaled, -1, -2))
 
 
 def cross_matrix(vectors: FloatArray) -> FloatArray:
-    """Return the matrices [v]× (..., 3, 3) of vectors (..., 3), with [v]× w = v × w."""
+    """Return the skew-symmetric matrices [v]× (..., 3, 3) of vectors v (..., 3): [v]× w = v × w."""
     matrices = np.zeros((*vectors.shape, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         matrices[..., j, k], matrices[..., k, j] = -vectors[..., i], vectors[..., i]

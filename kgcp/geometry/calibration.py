@@ -16,27 +16,29 @@ CALIBRATION_PARAMETERS = (
 )
 """Fields of `Camera` that a calibration estimates, in OpenCV's order."""
 
-_ASYMMETRY = 1e-9  # relative: both halves are the same number, perhaps rounded twice
-_NEGATIVE_EIGENVALUE = 1e-6  # of the correlations: what rounding to six digits may leave
+_MAX_ASYMMETRY = 1e-9  # relative: allows for separate rounding of the two halves
+# Smallest eigenvalue of the correlation matrix that is accepted, negated: rounding to six digits
+# may make zero negative by as much.
+_MAX_NEGATIVE_EIGENVALUE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationCovariance:
-    """Covariance of the calibration: an error that all frames of a flight share."""
+    """Covariance of the calibration, whose error all frames of a flight share."""
 
-    # (12, 12): in the order and the units of `CALIBRATION_PARAMETERS`; rows of zeros: taken for
-    # exact
+    # (12, 12): in the order and units of `CALIBRATION_PARAMETERS`; zeros for parameters that are
+    # taken as exact
     cov: FloatArray
 
     @classmethod
     def of(cls, names: tuple[str, ...], cov: FloatArray) -> CalibrationCovariance:
-        """Return the covariance (n, n) of some parameters as one of all.
+        """Return the covariance of all parameters, given that of the named ones (n, n).
 
         Raises
         ------
         SettingError
-            For `cov_of`, if a name is unknown or repeated; for `cov`, if its size is not that of
-            the names, or it is not symmetric or not positive semidefinite.
+            With key `cov_of` if a name is unknown or repeated. With key `cov` if the matrix does
+            not have one row and column per name, is not symmetric, or is not positive semidefinite.
         """
         listed = ", ".join(CALIBRATION_PARAMETERS)
         if not names or len(set(names)) < len(names) or not {*names} <= {*CALIBRATION_PARAMETERS}:
@@ -57,13 +59,13 @@ class CalibrationCovariance:
 
 
 def _check_covariance(cov: FloatArray) -> None:
-    if not np.allclose(cov, cov.T, rtol=_ASYMMETRY, atol=0.0):
+    if not np.allclose(cov, cov.T, rtol=_MAX_ASYMMETRY, atol=0.0):
         raise SettingError("cov", "is not symmetric", "give both halves of the matrix")
     sd = np.sqrt(np.maximum(np.diag(cov), 0.0))
     scale = np.where(sd > 0.0, sd, 1.0)
     correlation = cov / np.outer(scale, scale)
     is_valid = np.all(np.diag(cov) >= 0.0) and not np.any(cov[sd == 0.0])
-    if not is_valid or np.linalg.eigvalsh(correlation)[0] < -_NEGATIVE_EIGENVALUE:
+    if not is_valid or np.linalg.eigvalsh(correlation)[0] < -_MAX_NEGATIVE_EIGENVALUE:
         raise SettingError(
             "cov",
             "is not a covariance: some combination has a negative variance",
@@ -71,13 +73,18 @@ def _check_covariance(cov: FloatArray) -> None:
         )
 
 
-def image_by_calibration(camera: Camera, normalised: FloatArray) -> FloatArray:
-    """Return how raw pixels move with the calibration, at normalised coordinates (n, 2).
+def distort_jacobian_by_calibration(camera: Camera, normalised: FloatArray) -> FloatArray:
+    """Return the derivatives of `Camera.distort` by the calibration.
+
+    Parameters
+    ----------
+    normalised : (n, 2) array
+        Where they are evaluated: normalised coordinates.
 
     Returns
     -------
     (n, 2, 12) array
-        Derivatives of `Camera.distort`: rows x, y [px], columns `CALIBRATION_PARAMETERS`.
+        Rows x, y [px], columns `CALIBRATION_PARAMETERS`.
     """
     x, y = normalised[:, 0], normalised[:, 1]
     r2 = x * x + y * y

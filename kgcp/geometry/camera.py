@@ -1,7 +1,8 @@
-"""The frame camera: Brown-Conrady distortion in OpenCV's order, exactly invertible.
+"""The frame camera, with Brown-Conrady distortion in OpenCV's order of coefficients.
 
-Pixel (0, 0) is the centre of the top-left pixel; camera axes are x right, y down, z forward.
-"Normalised" coordinates are (x/z, y/z) in that frame, free of distortion.
+The origin of pixel coordinates is the centre of the top-left pixel. Camera axes are x right, y
+down, z forward. "Normalised" coordinates are (x/z, y/z) in the camera frame, free of distortion.
+"Raw" pixels are those of the frame, with distortion.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from kgcp.geometry.distortion import (
     Scale,
     distort_circles,
     distort_points,
-    distort_slopes,
+    fill_in_jacobians,
     first_fold_r2,
     undistort_points,
 )
@@ -37,14 +38,14 @@ class Response(StrEnum):
 
 
 class TimeReference(StrEnum):
-    """Moment of the exposure that the frames' times refer to."""
+    """The moment of the exposure that a frame's time stamp refers to."""
 
     START = "start"
     MIDDLE = "middle"
     END = "end"
 
     def to_middle_s(self, exposure_time_s: float) -> float:
-        """Return what leads from this moment to mid-exposure [s]."""
+        """Return the time from this moment to mid-exposure [s]."""
         return {"start": 0.5, "middle": 0.0, "end": -0.5}[self.value] * exposure_time_s
 
 
@@ -59,16 +60,17 @@ class Camera:
     fx, fy, cx, cy : float
         Principal distances and principal point [px].
     k1, k2, p1, p2, k3, k4, k5, k6 : float
-        Distortion coefficients in OpenCV's meaning and order (k4…k6: rational denominator).
+        Distortion coefficients as OpenCV defines and orders them (k4…k6: rational denominator).
     response : Response
-        How grey values follow light.
+        How grey values depend on light.
     readout_s : float
-        Rolling shutter: time from the first to the last row [s]; 0 is a global shutter.
+        Rolling shutter: time from the first to the last row [s]; 0 for a global shutter.
     motion_sd_deg_s : float
-        With a rolling shutter, how fast the scene turns about each of the camera's axes where that
-        is not known: standard deviation [deg/s].
+        Standard deviation of the scene's rate of rotation about each camera axis [deg/s]. Used with
+        a rolling shutter where the rotation is not known.
     time_reference : TimeReference
-        What the frames' times are of, before they are brought to mid-exposure.
+        Moment of the exposure that the time stamps of the input refer to. They are converted to
+        mid-exposure.
     """
 
     width: int
@@ -101,19 +103,19 @@ class Camera:
         readout_s: float = 0.0,
         motion_sd_deg_s: float = 5.0,
     ) -> Self:
-        """Return the camera that `cv2.calibrateCamera` found.
+        """Return a camera from the results of `cv2.calibrateCamera`.
 
         Parameters
         ----------
         camera_matrix : (3, 3) array
             Principal distances and principal point [px]; without skew.
         distortion : array of 0, 4, 5 or 8 numbers, in any shape
-            k1, k2, p1, p2, k3, k4, k5, k6. The further numbers of OpenCV's models of 12 and 14
-            (thin prism, tilted sensor) must be zero.
+            k1, k2, p1, p2, k3, k4, k5, k6. OpenCV's models with 12 and 14 coefficients (thin prism,
+            tilted sensor) are accepted if the further ones are zero.
         size : tuple of int
             Width and height of the frames [px], as OpenCV's `imageSize`.
         response, readout_s, motion_sd_deg_s
-            As the fields of these names.
+            See the attributes of these names.
 
         Raises
         ------
@@ -179,7 +181,7 @@ class Camera:
         require_range("motion_sd_deg_s", self.motion_sd_deg_s, 0.0, 1000.0, unit="deg/s")
 
     def binned(self, count: int) -> Camera:
-        """Return the camera whose pixels are squares of `count` by `count` of this one's."""
+        """Return the camera after binning: its pixels are squares of `count` × `count` of these."""
         height = self.height // count
         return replace(
             self,
@@ -189,7 +191,7 @@ class Camera:
             fy=self.fy / count,
             cx=(self.cx - 0.5 * (count - 1)) / count,
             cy=(self.cy - 0.5 * (count - 1)) / count,
-            # from the middle of the first bins to that of the last ones
+            # from the middle row of the first bins to that of the last ones
             readout_s=self.readout_s * count * (height - 1) / (self.height - 1),
         )
 
@@ -199,11 +201,11 @@ class Camera:
         return math.sqrt(self.fx * self.fy)
 
     def rows_since_middle(self, pixels: FloatArray) -> FloatArray:
-        """Return how far below the middle row pixels (n, 2) lie (n,), in frames: -0.5 … 0.5."""
+        """Return how far pixels (n, 2) lie below the middle row, in frame heights: -0.5 … 0.5."""
         return pixels[:, 1] / (self.height - 1) - 0.5
 
     def delay_s(self, pixels: FloatArray) -> FloatArray:
-        """Return how much later than the middle row pixels (n, 2) are exposed (n,) [s]."""
+        """Return how much later than the middle row pixels (n, 2) are exposed: (n,) [s]."""
         return self.readout_s * self.rows_since_middle(pixels)
 
     def project(self, points_camera: FloatArray) -> FloatArray:
@@ -213,7 +215,7 @@ class Camera:
     def project_circles(
         self, axes: FloatArray, centre_m: FloatArray, radii_m: FloatArray, circle: FloatArray
     ) -> FloatArray:
-        """Project circles about one centre, in one plane, to raw pixels (m, k, 2).
+        """Project concentric circles in a plane to raw pixels (m, k, 2).
 
         Parameters
         ----------
@@ -222,8 +224,9 @@ class Camera:
         centre_m : (3,) array
             In the camera frame [m].
         radii_m : (m,) array
+            Of the circles.
         circle : (k, 2) array
-            Points of the unit circle, along these axes.
+            Points of the unit circle to project, in the coordinates of these axes.
         """
         pixels = np.empty((len(radii_m), len(circle), 2))
         distort_circles(self._lens, self._scale, axes, centre_m, radii_m, circle, pixels)
@@ -239,8 +242,8 @@ class Camera:
     def undistort(self, pixels: FloatArray) -> FloatArray:
         """Map raw pixels (n, 2) to normalised coordinates (n, 2).
 
-        Newton's method with the analytic Jacobian, to 1e-13; pixels that the distortion model
-        cannot reach (beyond its fold) come back as NaN.
+        Newton's method with the analytic Jacobian converges to 1e-13. Pixels that the distortion
+        model cannot reach, beyond its fold, are returned as NaN.
         """
         normalised = np.empty(np.shape(pixels))
         places = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
@@ -249,10 +252,10 @@ class Camera:
         return normalised
 
     def distort_jacobian(self, normalised: FloatArray) -> FloatArray:
-        """Return the derivatives (n, 2, 2) of `distort`: rows x, y [px], columns the input."""
+        """Return the Jacobians (n, 2, 2) of `distort`: rows x, y [px], columns normalised x, y."""
         slopes = np.empty((*normalised.shape, 2))
         points = np.asarray(normalised, dtype=np.float64).reshape(-1, 2)
-        distort_slopes(self._lens, self._scale, points, slopes.reshape(-1, 2, 2))
+        fill_in_jacobians(self._lens, self._scale, points, slopes.reshape(-1, 2, 2))
         return slopes
 
     @property

@@ -1,12 +1,13 @@
-"""Circles seen through a lens: moments of their images, and how far these are from the centre.
+"""Images of circles through a lens: their moments, and the eccentricity of their centroids.
 
-The image of a circle is an ellipse only before the lens distorts it, and the ellipse's centre is
-not the image of the circle's centre (Otepka & Fraser 2004). Both effects are exact here: the
+The image of a circle is an ellipse only before the lens distorts it. And the ellipse's centre is
+not the image of the circle's centre (Otepka & Fraser 2004). Both effects are modelled exactly: the
 outline is projected point by point, and Green's theorem turns integrals over the area into
-integrals along it. The outline is a smooth periodic curve, so that equal steps of the angle
-converge exponentially: 32 points give a circle of usual size to 1e-10 px.
+integrals along the outline. The outline is a smooth periodic curve, for which sums over equal steps
+of the angle converge exponentially. 32 points are accurate to 1e-10 px for circles of usual size.
 
-An outline that is displaced by δ changes ∫ f dA by ∮ f (δ_x dy − δ_y dx). All derivatives follow.
+If the outline is displaced by δ, ∫ f dA changes by ∮ f (δ_x dy − δ_y dx). All derivatives are
+derived from that.
 """
 
 from __future__ import annotations
@@ -17,29 +18,31 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import cross_matrix
-from kgcp.geometry.calibration import image_by_calibration
+from kgcp.geometry.calibration import distort_jacobian_by_calibration
 from kgcp.geometry.camera import Camera
 
-OUTLINE_POINTS = 32  # along an outline
-_ANGLES = 2.0 * np.pi / OUTLINE_POINTS * np.arange(OUTLINE_POINTS)
-_UNIT_CIRCLE = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))
+OUTLINE_POINTS = 32  # of one circle
+_ANGLES_RAD = 2.0 * np.pi / OUTLINE_POINTS * np.arange(OUTLINE_POINTS)
+_UNIT_CIRCLE = np.column_stack((np.cos(_ANGLES_RAD), np.sin(_ANGLES_RAD)))
 
 
-def _fourier_slopes(count: int) -> FloatArray:
-    """Return the matrix (k, k) that differentiates periodic values at k equal steps of 2π/k."""
+def _fourier_differentiation(count: int) -> FloatArray:
+    """Return the matrix (k, k) that differentiates a periodic function given at k equal steps."""
     lag = np.subtract.outer(np.arange(count), np.arange(count))
     sign = np.where(lag % 2 == 0, 0.5, -0.5)
     with np.errstate(divide="ignore"):
         return np.where(lag == 0, 0.0, sign / np.tan(np.pi * lag / count))
 
 
-_SLOPES = _fourier_slopes(OUTLINE_POINTS)
-_STEP = 2.0 * np.pi / OUTLINE_POINTS
-_LEAST_AREA = 1e-20  # px², or of the normalised plane: rounding of coordinates has as much
+_DIFFERENTIATION = _fourier_differentiation(OUTLINE_POINTS)
+_STEP_RAD = 2.0 * np.pi / OUTLINE_POINTS
+# Smaller areas are rounding errors of the coordinates. In px², or in the unit of normalised
+# coordinates squared.
+_MIN_AREA = 1e-20
 
 
 def plane_axes(normals: FloatArray) -> FloatArray:
-    """Return two perpendicular unit vectors (n, 3, 2) square to each of n unit vectors (n, 3)."""
+    """Return two orthogonal unit vectors (n, 3, 2) of the planes with unit normals (n, 3)."""
     turns = cross_matrix(normals)
     first = np.where(np.abs(normals[:, :1]) < 0.9, turns[..., 0], turns[..., 1])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -59,11 +62,11 @@ class Circles3D:
     def with_normals(
         cls, centres_m: FloatArray, normals: FloatArray, radii_m: FloatArray
     ) -> Circles3D:
-        """Return circles square to unit normals (n, 3)."""
+        """Return circles in planes with unit normals (n, 3)."""
         return cls(centres_m, plane_axes(normals), radii_m)
 
     def arms_m(self) -> FloatArray:
-        """Return points (n, k, 3) of the circles, from their centres [m]."""
+        """Return the vectors (n, k, 3) from the centres to points of the circles [m]."""
         arms = np.einsum("nij,kj->nki", self.axes, _UNIT_CIRCLE)
         return np.asarray(self.radii_m[:, None, None] * arms)
 
@@ -79,19 +82,20 @@ class CircleImages:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CircleSlopes:
-    """The moments of n circles' images, and their derivatives."""
+class CircleDerivatives:
+    """The moments of n circles' images and their partial derivatives."""
 
-    moments: FloatArray  # (n, 5): as `CircleImages`
-    by_centre: FloatArray  # (n, 5, 3): of the circle's centre in the camera frame [m]
-    # (n, 5, 3): by a rotation vector of its plane about its own centre, camera frame [rad]
+    moments: FloatArray  # (n, 5): as in `CircleImages`
+    by_centre: FloatArray  # (n, 5, 3): by the circle's centre in the camera frame [m]
+    # (n, 5, 3): by a rotation vector [rad] in the camera frame that turns the circle's plane about
+    # the circle's centre
     by_rotation: FloatArray
-    by_radius: FloatArray  # (n, 5) [1/m]
+    by_radius: FloatArray  # (n, 5): by the radius [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Eccentricity:
-    """How far the centroids of n circles' images are from the images of their centres.
+    """Differences between the centroids of n circles' images and the images of their centres.
 
     centroid = image of the centre + perspective + in_marker.
     """
@@ -99,25 +103,26 @@ class Eccentricity:
     centres_px: FloatArray  # (n, 2): images of the circles' centres
     # (n, 2): distorted centre of the undistorted ellipse − image of the circle's centre
     perspective_px: FloatArray
-    # (n, 2): centroid of the distorted outline − distorted centre of the undistorted ellipse:
-    # distortion that changes within the marker
+    # (n, 2): centroid of the distorted outline − distorted centre of the undistorted ellipse: the
+    # effect of distortion that varies within the marker
     in_marker_px: FloatArray
 
     @property
     def total_px(self) -> FloatArray:
-        """Both together (n, 2): what to subtract from a centroid to have the centre's image."""
+        """Both together (n, 2): centroid − image of the centre."""
         return self.perspective_px + self.in_marker_px
 
 
 def circle_images(camera: Camera, circles: Circles3D) -> CircleImages:
-    """Return outlines, areas and moments of circles' images; NaN of those that have none.
+    """Return outlines, areas and moments of circles' images.
 
-    They must be wholly before the camera, and not endlessly far.
+    They are NaN for circles that are not entirely in front of the camera, or so far away that their
+    images have no area.
 
     Parameters
     ----------
     camera : Camera
-        With its distortion, which acts on every point of the outline.
+        Its distortion is applied to every point of the outlines.
     circles : Circles3D
         In the camera frame.
     """
@@ -126,8 +131,8 @@ def circle_images(camera: Camera, circles: Circles3D) -> CircleImages:
     return CircleImages(area, moments, outlines)
 
 
-def circle_slopes(camera: Camera, circles: Circles3D) -> CircleSlopes:
-    """Return the moments of `circle_images` and their derivatives, analytically."""
+def circle_derivatives(camera: Camera, circles: Circles3D) -> CircleDerivatives:
+    """Return the moments of `circle_images` and their analytic derivatives."""
     arms = circles.arms_m()
     points = circles.centres_m[:, None] + arms
     normalised = _outlines(circles)
@@ -140,39 +145,42 @@ def circle_slopes(camera: Camera, circles: Circles3D) -> CircleSlopes:
     projection[..., 0, 2], projection[..., 1, 2] = -x, -y
     projection /= points[..., 2, None, None]
     by_point = camera.distort_jacobian(normalised) @ projection
-    # a turn ω moves an arm a by ω × a, hence g · (ω × a) = ω · (a × g)
-    by_turn = by_point @ cross_matrix(-arms)
+    # a rotation vector ω moves an arm a by ω × a; with a gradient g, g · (ω × a) = ω · (a × g)
+    by_rotation = by_point @ cross_matrix(-arms)
     by_radius = by_point @ (arms / circles.radii_m[:, None, None])[..., None]
-    return CircleSlopes(
+    return CircleDerivatives(
         moments,
         _along_outlines(weights, by_point),
-        _along_outlines(weights, by_turn),
+        _along_outlines(weights, by_rotation),
         _along_outlines(weights, by_radius)[..., 0],
     )
 
 
-def moments_by_calibration(camera: Camera, circles: Circles3D) -> FloatArray:
-    """Return the derivatives (n, 5, 12) of the moments by `CALIBRATION_PARAMETERS`."""
+def moments_jacobian_by_calibration(camera: Camera, circles: Circles3D) -> FloatArray:
+    """Return the derivatives (n, 5, 12) of the circles' moments by `CALIBRATION_PARAMETERS`."""
     normalised = _outlines(circles)
     outlines = _distorted(camera, normalised)
     weights = _boundary_weights(outlines, *_moments(outlines))
-    by_camera = image_by_calibration(camera, normalised.reshape(-1, 2))
+    by_camera = distort_jacobian_by_calibration(camera, normalised.reshape(-1, 2))
     return _along_outlines(weights, by_camera.reshape(*normalised.shape, -1))
 
 
 def _along_outlines(weights: FloatArray, by_point: FloatArray) -> FloatArray:
-    """Return derivatives (n, 5, p) of moments from those of the outlines' points (n, k, 2, p)."""
+    """Chain derivatives of the outlines' points (n, k, 2, p) to those of the moments (n, 5, p).
+
+    `weights` are those of `_boundary_weights`.
+    """
     count, points = weights.shape[:2]
     flat = weights.transpose(0, 2, 1, 3).reshape(count, 5, 2 * points)
     return np.asarray(flat @ by_point.reshape(count, 2 * points, -1))
 
 
 def eccentricity(camera: Camera, circles: Circles3D) -> Eccentricity:
-    """Return how far centroids of circles' images are from their centres, by cause.
+    """Return the eccentricity of circles' images, separated by cause.
 
-    Two causes, as in figures 5 and 6 of ISPRS Archives XXXVII-B1 (2008): the perspective's part is
-    what an ideal lens would show (Dold 1997), carried through the distortion at the ellipse's
-    centre; the rest is distortion that changes within the marker.
+    There are two causes, as in figures 5 and 6 of ISPRS Archives XXXVII-B1 (2008). The part of the
+    perspective is what an ideal lens would show (Dold 1997), mapped through the distortion. The
+    rest is due to distortion that varies within the marker.
     """
     ideal = _outlines(circles)
     ellipse_centres = _moments(ideal)[1][:, :2]
@@ -185,7 +193,7 @@ def eccentricity(camera: Camera, circles: Circles3D) -> Eccentricity:
 
 
 def _outlines(circles: Circles3D) -> FloatArray:
-    """Return normalised points (n, k, 2); NaN for circles that are not wholly before the camera."""
+    """Return normalised outlines (n, k, 2); NaN for circles not entirely in front of the camera."""
     points = circles.centres_m[:, None] + circles.arms_m()
     depth = np.where(np.all(points[..., 2] > 0.0, axis=1)[:, None], points[..., 2], np.nan)
     return np.asarray(points[..., :2] / depth[..., None])
@@ -198,20 +206,21 @@ def _distorted(camera: Camera, normalised: FloatArray) -> FloatArray:
 def _moments(outlines: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return areas (n,) and moments (n, 5) of closed outlines (n, k, 2), by Green's theorem.
 
-    About the outline's middle, so that differences of large numbers do not cost digits.
+    The integrals are taken about the mean of the points: differences of large numbers would lose
+    digits.
     """
     middle = outlines.mean(axis=1)
     x, y = np.moveaxis(outlines - middle[:, None], -1, 0)
-    dx, dy = x @ _SLOPES.T * _STEP, y @ _SLOPES.T * _STEP
+    dx, dy = x @ _DIFFERENTIATION.T * _STEP_RAD, y @ _DIFFERENTIATION.T * _STEP_RAD
     area = 0.5 * np.sum(x * dy - y * dx, axis=1)
-    area[np.abs(area) < _LEAST_AREA] = np.nan
-    orientation = area  # the same sign in all integrals: it cancels
+    area[np.abs(area) < _MIN_AREA] = np.nan
+    signed_area = area  # all integrals have the sign of the outline's sense, which cancels
     x2_dy, y2_dx = x * x * dy, y * y * dx
-    mean_x = 0.5 * np.sum(x2_dy, axis=1) / orientation
-    mean_y = -0.5 * np.sum(y2_dx, axis=1) / orientation
-    xx = np.sum(x * x2_dy, axis=1) / (3.0 * orientation) - mean_x**2
-    yy = -np.sum(y * y2_dx, axis=1) / (3.0 * orientation) - mean_y**2
-    xy = 0.5 * np.sum(y * x2_dy, axis=1) / orientation - mean_x * mean_y
+    mean_x = 0.5 * np.sum(x2_dy, axis=1) / signed_area
+    mean_y = -0.5 * np.sum(y2_dx, axis=1) / signed_area
+    xx = np.sum(x * x2_dy, axis=1) / (3.0 * signed_area) - mean_x**2
+    yy = -np.sum(y * y2_dx, axis=1) / (3.0 * signed_area) - mean_y**2
+    xy = 0.5 * np.sum(y * x2_dy, axis=1) / signed_area - mean_x * mean_y
     moments = np.column_stack((middle[:, 0] + mean_x, middle[:, 1] + mean_y, xx, xy, yy))
     return np.abs(area), moments
 
@@ -221,7 +230,7 @@ def _boundary_weights(
 ) -> FloatArray:
     """Return the derivatives (n, k, 5, 2) of the moments by the points of the outlines."""
     x, y = np.moveaxis(outlines, -1, 0)
-    dx, dy = x @ _SLOPES.T * _STEP, y @ _SLOPES.T * _STEP
+    dx, dy = x @ _DIFFERENTIATION.T * _STEP_RAD, y @ _DIFFERENTIATION.T * _STEP_RAD
     sign = np.sign(np.sum((x - moments[:, :1]) * dy - (y - moments[:, 1:2]) * dx, axis=1))
     flux = np.stack((dy, -dx), axis=-1) * (sign / area_px2)[:, None, None]
     off_x, off_y = x - moments[:, :1], y - moments[:, 1:2]

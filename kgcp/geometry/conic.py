@@ -1,7 +1,7 @@
-"""Conics in the plane as symmetric 3×3 matrices: x ᵀ Q x = 0 for homogeneous points x = (x, y, 1).
+"""Conics in the plane as symmetric 3×3 matrices: xᵀ Q x = 0 for homogeneous points x = (x, y, 1).
 
-The matrix of an ellipse is kept with two positive eigenvalues and a negative one, so that
-x ᵀ Q x is negative inside.
+The sign of an ellipse's matrix is chosen so that xᵀ Q x is negative inside: it has two positive
+eigenvalues and a negative one.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _MIN_POINTS = 6
 
 @dataclass(frozen=True, slots=True)
 class Ellipse:
-    """An ellipse by its centre, semi-axes and direction."""
+    """An ellipse, given by its centre, semi-axes and direction."""
 
     # centre
     x: float
@@ -36,12 +36,12 @@ class Ellipse:
 
     @property
     def mean_radius(self) -> float:
-        """Radius of the circle of the same area."""
+        """Radius of the circle with the same area."""
         return math.sqrt(self.a * self.b)
 
     @property
     def stretch(self) -> FloatArray:
-        """Symmetric matrix (2, 2) that makes this ellipse, up to its centre, of the unit circle."""
+        """Symmetric matrix (2, 2) that maps the unit circle to this ellipse about the origin."""
         c, s = math.cos(self.angle_rad), math.sin(self.angle_rad)
         xy = (self.a - self.b) * c * s
         return np.array(
@@ -63,22 +63,23 @@ class Ellipse:
         return np.array([[xx, xy, x], [xy, yy, y], [x, y, rest]])
 
     def points(self, angles_rad: FloatArray, factor: float = 1.0) -> FloatArray:
-        """Return points (…, 2) at angles (…) on the ellipse times `factor` about its centre.
+        """Return points (…, 2) at angles (…) on the ellipse, scaled by `factor` about its centre.
 
-        The angles are those of the unit circle before it is stretched along the axes, without a
-        rotation: for a nearly frontal circle they are directions on the plate plus its heading.
+        The angles are those on the unit circle, which `stretch` maps to the ellipse without a
+        rotation. If a circle is seen almost frontally, they are directions on the plate plus the
+        plate's heading.
         """
         unit = np.empty((*np.shape(angles_rad), 2))
         unit[..., 0], unit[..., 1] = np.cos(angles_rad), np.sin(angles_rad)
         return factor * unit @ self.stretch + self.centre
 
     def scaled(self, factor: float) -> Ellipse:
-        """Return the ellipse with both axes times `factor` about the same centre."""
+        """Return the ellipse with the same centre and both axes multiplied by `factor`."""
         return Ellipse(self.x, self.y, factor * self.a, factor * self.b, self.angle_rad)
 
 
 def oriented(conic: FloatArray) -> FloatArray:
-    """Return the conic (3, 3) symmetric, of unit norm, and negative inside if it is an ellipse."""
+    """Return the conic (3, 3), symmetric, with unit norm; xᵀ Q x is negative inside an ellipse."""
     symmetric = 0.5 * (conic + conic.T)
     norm = math.sqrt(np.vdot(symmetric, symmetric))
     sign = 1.0 if symmetric[0, 0] + symmetric[1, 1] > 0.0 else -1.0
@@ -86,13 +87,13 @@ def oriented(conic: FloatArray) -> FloatArray:
 
 
 def transform_conic(conic: FloatArray, homography: FloatArray) -> FloatArray:
-    """Return the conic (3, 3) of the points x' = homography @ x for x on `conic`."""
+    """Return the conic (3, 3) to which a homography maps `conic` (x' = homography @ x)."""
     inverse = np.linalg.inv(homography)
     return oriented(inverse.T @ conic @ inverse)
 
 
 def ellipse_from_conic(conic: FloatArray) -> Ellipse:
-    """Return centre, axes and direction of a conic (3, 3).
+    """Return the ellipse that a conic (3, 3) describes.
 
     Raises
     ------
@@ -113,17 +114,17 @@ def ellipse_from_conic(conic: FloatArray) -> Ellipse:
 
 
 def _direction(axis: FloatArray) -> float:
-    """Angle of an undirected axis in (-π/2, π/2]."""
+    """Return the angle of an axis without orientation [rad], in (-π/2, π/2]."""
     angle = math.atan2(axis[1], axis[0])
     return angle - math.pi * math.ceil(angle / math.pi - 0.5)
 
 
 def fit_ellipse(points: FloatArray) -> FloatArray:
-    """Fit an ellipse to points (n, 2), at least six, and return it as a conic (3, 3).
+    """Fit an ellipse to at least six points (n, 2) and return it as a conic (3, 3).
 
     Direct least squares: Fitzgibbon's constraint 4ac - b² = 1 in the block form of Halíř & Flusser
-    (1998), "Numerically stable direct least squares fitting of ellipses", on points centred and
-    scaled to unit size.
+    (1998), "Numerically stable direct least squares fitting of ellipses". The points are centred
+    and scaled to unit size before.
 
     Raises
     ------
@@ -142,7 +143,7 @@ def fit_ellipse(points: FloatArray) -> FloatArray:
 
 
 def _direct_fit(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Coefficients (6,) of x², xy, y², x, y, 1."""
+    """Return the conic's coefficients (6,) of x², xy, y², x, y, 1."""
     quadratic = np.column_stack((x * x, x * y, y * y))
     linear = np.column_stack((x, y, np.ones_like(x)))
     try:
@@ -160,7 +161,7 @@ def _direct_fit(x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def sampson_distance(conic: FloatArray, points: FloatArray) -> FloatArray:
-    """Return first-order signed distances (n,) of points (n, 2) from a conic, negative inside."""
+    """Return first-order distances (n,) of points (n, 2) from a conic; negative inside."""
     homogeneous = np.column_stack((points, np.ones(len(points))))
     form = homogeneous @ oriented(conic)
     value = np.einsum("ni,ni->n", form, homogeneous)
@@ -182,8 +183,8 @@ def chord(conic: FloatArray, point: FloatArray, angles_rad: FloatArray) -> Float
     Returns
     -------
     (2, n, 2) array
-        For each line the end behind the point (A) and the end ahead of it (B); NaN where the
-        line misses the ellipse.
+        The intersections of each line: behind the point (A), then ahead of it (B). NaN if the line
+        misses the ellipse.
     """
     directions = np.stack((np.cos(angles_rad), np.sin(angles_rad)), axis=-1)
     form = oriented(conic)
@@ -191,7 +192,7 @@ def chord(conic: FloatArray, point: FloatArray, angles_rad: FloatArray) -> Float
     along = directions @ form[:2, :2]
     quadratic = np.einsum("ni,ni->n", along, directions)
     linear = directions @ (form[:2] @ origin)
-    with np.errstate(invalid="ignore"):  # a line that misses: NaN, as promised
+    with np.errstate(invalid="ignore"):  # NaN if the line misses
         half = np.sqrt(linear**2 - quadratic * (origin @ form @ origin))
     lengths = np.stack((-linear - half, -linear + half)) / quadratic
     return np.asarray(point + lengths[..., None] * directions)

@@ -1,4 +1,4 @@
-"""Brown-Conrady distortion in OpenCV's order of coefficients, point by point; compiled."""
+"""Brown-Conrady distortion in OpenCV's order of coefficients, and its inverse: compiled loops."""
 
 from __future__ import annotations
 
@@ -10,11 +10,15 @@ import numpy as np
 from kgcp.geometry._jit import compiled_if_often, interpreted
 from kgcp.geometry.arrays import FloatArray
 
+# The "fold" is where the distorted radius stops growing with the undistorted one. Beyond it the
+# mapping is not invertible.
 _MAX_NEWTON_STEPS = 30
-_NEWTON_TOLERANCE = 1e-8  # convergence is quadratic: the step leaves its square
-_FARTHEST = 4.0  # normalised radius, 76° off the axis: no ray beyond it from a lens that folds
-_RADII = np.linspace(0.0, _FARTHEST, 801)
-_STEPS = 128  # from the axis to a point, in search of the fold
+_NEWTON_TOLERANCE = 1e-8  # of the last step; convergence is quadratic, so the error is its square
+# Largest normalised radius that is considered, 76° off the axis. If a lens model folds, no ray
+# beyond it is accepted.
+_MAX_RADIUS = 4.0
+_RADII = np.linspace(0.0, _MAX_RADIUS, 801)
+_FOLD_STEPS = 128  # from the axis to a point, when testing whether the fold lies between
 
 Lens = tuple[float, float, float, float, float, float, float, float]
 """k1, k2, p1, p2, k3, k4, k5, k6."""
@@ -22,7 +26,7 @@ Lens = tuple[float, float, float, float, float, float, float, float]
 Scale = tuple[float, float, float, float]
 """fx, fy, cx, cy [px]."""
 
-_Real = TypeVar("_Real", float, FloatArray)  # one number, or those of many points
+_Real = TypeVar("_Real", float, FloatArray)  # one number, or one per point
 
 
 @compiled_if_often
@@ -37,15 +41,15 @@ def _radial(lens: Lens, r2: _Real) -> tuple[_Real, _Real]:
     return factor, (slope_above - factor * slope_below) / below
 
 
-_radial_of_many = interpreted(_radial)  # the program itself takes one call per camera
+_radial_of_many = interpreted(_radial)  # called once per camera: not worth compiling
 
 
 @lru_cache
 def first_fold_r2(lens: Lens) -> float:
-    """Return the squared radius at which the radial distortion turns back; infinite: nowhere."""
+    """Return the squared normalised radius at which the radial distortion folds, or infinity."""
     r2 = _RADII**2
     factor, slope = _radial_of_many(lens, r2)
-    with np.errstate(all="ignore"):  # coefficients are any finite numbers
+    with np.errstate(all="ignore"):  # coefficients may be any finite numbers
         is_before = (factor > 0.0) & (factor + 2.0 * r2 * slope > 0.0)
     return np.inf if is_before.all() else float(r2[np.argmin(is_before)])
 
@@ -63,8 +67,8 @@ def _distorted(lens: Lens, x: _Real, y: _Real) -> tuple[_Real, _Real]:
 
 
 @compiled_if_often
-def _slopes(lens: Lens, x: float, y: float) -> tuple[float, float, float]:
-    """Return the derivatives of the distorted x by x, of either by the other, and of y by y."""
+def _jacobian(lens: Lens, x: float, y: float) -> tuple[float, float, float]:
+    """Return the elements xx, xy = yx and yy of the distortion's Jacobian, which is symmetric."""
     p1, p2 = lens[2], lens[3]
     factor, slope = _radial(lens, x * x + y * y)
     return (
@@ -76,11 +80,11 @@ def _slopes(lens: Lens, x: float, y: float) -> tuple[float, float, float]:
 
 @compiled_if_often
 def _is_before_fold(lens: Lens, x: float, y: float) -> bool:
-    """Tell whether the distortion turns nowhere between the axis and a normalised point."""
-    if x * x + y * y > _FARTHEST * _FARTHEST:
+    """Tell whether the Jacobian's determinant is positive from the axis to a normalised point."""
+    if x * x + y * y > _MAX_RADIUS * _MAX_RADIUS:
         return False
-    for k in range(1, _STEPS):
-        xx, xy, yy = _slopes(lens, x * k / _STEPS, y * k / _STEPS)
+    for k in range(1, _FOLD_STEPS):
+        xx, xy, yy = _jacobian(lens, x * k / _FOLD_STEPS, y * k / _FOLD_STEPS)
         if xx * yy - xy * xy <= 0.0:
             return False
     return True
@@ -88,7 +92,10 @@ def _is_before_fold(lens: Lens, x: float, y: float) -> bool:
 
 @compiled_if_often
 def distort_points(lens: Lens, scale: Scale, points: FloatArray, pixels: FloatArray) -> None:
-    """Map normalised points (n, 2) to pixels, all at once: so Python takes one call for many."""
+    """Fill in the pixels (n, 2) of normalised points (n, 2), with array operations.
+
+    So the interpreted version is one call for all points, too.
+    """
     fx, fy, cx, cy = scale
     x, y = _distorted(lens, points[:, 0], points[:, 1])
     pixels[:, 0], pixels[:, 1] = fx * x + cx, fy * y + cy
@@ -104,10 +111,10 @@ def distort_circles(
     circle: FloatArray,
     pixels: FloatArray,
 ) -> None:
-    """Map circles of some radii (m,) in space to pixels (m, k, 2), by points of the unit circle.
+    """Fill in the pixels (m, k, 2) of concentric circles in space with radii (m,).
 
-    Their common centre is given in the camera frame, their plane by the first two columns of a
-    rotation.
+    Their centre is given in the camera frame, their plane by the first two columns of `axes`.
+    `circle` (k, 2) are points of the unit circle.
     """
     fx, fy, cx, cy = scale
     for m in range(len(radii)):
@@ -121,13 +128,13 @@ def distort_circles(
 
 
 @compiled_if_often
-def distort_slopes(lens: Lens, scale: Scale, points: FloatArray, slopes: FloatArray) -> None:
-    """Fill in the derivatives (n, 2, 2) of `distort_points`: rows of results, columns of points."""
+def fill_in_jacobians(lens: Lens, scale: Scale, points: FloatArray, jacobians: FloatArray) -> None:
+    """Fill in the Jacobians (n, 2, 2) of `distort_points`: rows pixels, columns points."""
     fx, fy, _, _ = scale
     for i in range(points.shape[0]):
-        xx, xy, yy = _slopes(lens, points[i, 0], points[i, 1])
-        slopes[i, 0, 0], slopes[i, 0, 1] = fx * xx, fx * xy
-        slopes[i, 1, 0], slopes[i, 1, 1] = fy * xy, fy * yy
+        xx, xy, yy = _jacobian(lens, points[i, 0], points[i, 1])
+        jacobians[i, 0, 0], jacobians[i, 0, 1] = fx * xx, fx * xy
+        jacobians[i, 1, 0], jacobians[i, 1, 1] = fy * xy, fy * yy
 
 
 @compiled_if_often
@@ -136,8 +143,9 @@ def undistort_points(
 ) -> None:
     """Invert `distort_points` by Newton's method, to 1e-13; NaN for pixels beyond the fold.
 
-    For these, it does not converge, or it does so where the distortion has turned: once, or twice.
-    Only points farther out than `fold_r2` need a test for the latter.
+    For such pixels the method does not converge, or it converges to a point beyond one fold or two.
+    One fold shows in the sign of the Jacobian. Two folds restore that sign, so that the path from
+    the axis must be tested: only for points farther out than `fold_r2`.
     """
     fx, fy, cx, cy = scale
     for i in range(pixels.shape[0]):
@@ -145,9 +153,9 @@ def undistort_points(
         y = wanted_y = (pixels[i, 1] - cy) / fy
         is_found = False
         for _ in range(_MAX_NEWTON_STEPS):
-            there_x, there_y = _distorted(lens, x, y)
-            xx, xy, yy = _slopes(lens, x, y)
-            off_x, off_y, determinant = there_x - wanted_x, there_y - wanted_y, xx * yy - xy * xy
+            at_x, at_y = _distorted(lens, x, y)
+            xx, xy, yy = _jacobian(lens, x, y)
+            off_x, off_y, determinant = at_x - wanted_x, at_y - wanted_y, xx * yy - xy * xy
             step_x = (yy * off_x - xy * off_y) / determinant
             step_y = (xx * off_y - xy * off_x) / determinant
             x, y = x - step_x, y - step_y

@@ -1,4 +1,4 @@
-"""Ellipses through edges along rays: `kgcp.geometry.conic.fit_ellipse` for many at once."""
+"""Direct ellipse fits to edge points on rays: `kgcp.geometry.conic.fit_ellipse` for many rings."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import BoolArray, FloatArray
 
-_RIDGE = 1e-9  # keeps the points of too few edges from a singular fit; they are refused anyway
+_RIDGE = 1e-9  # keeps fits to too few points from being singular; they are rejected later
 
 
 @compiled
@@ -17,26 +17,27 @@ def fit_ellipses(
     edges: FloatArray,
     inlying: BoolArray,
     directions: FloatArray,
-    most: float,
+    max_axis_ratio: float,
     ellipses: FloatArray,
     shares: FloatArray,
 ) -> None:
-    """Fit an ellipse to the edges of each ring (Fitzgibbon 1999; Halíř & Flusser 1998).
+    """Fit an ellipse to the edge points of each ring (Fitzgibbon 1999; Halíř & Flusser 1998).
 
     Parameters
     ----------
     edges : (n, rays) array
-        Distances from the origin.
+        Distances of the edge points from the origin.
     inlying : (n, rays) array of bool
-        Edges that count.
+        Edge points that are fitted.
     directions : (rays, 2) array
-        Unit vectors.
-    most : float
-        Ratio of axes.
+        Unit vectors of the rays.
+    max_axis_ratio : float
+        Largest ratio of the axes that is accepted.
     ellipses : (n, 5) array
         Filled in: centre, semi-major and semi-minor axis, direction of the major one [rad].
     shares : (n,) array
-        Filled in: share of edges that count; 0 if no ellipse fits or its axes differ too much.
+        Filled in: share of the rays that are fitted; 0 if no ellipse fits or its axes differ too
+        much.
     """
     powers = np.empty(5)
     moments = np.empty((5, 5))
@@ -56,13 +57,13 @@ def fit_ellipses(
                     for q in range(5 - p):
                         moments[p, q] += power * powers[q]
                     power *= x
-        if not (_fit(moments, ellipses[i]) and ellipses[i, 2] <= most * ellipses[i, 3]):
+        if not (_fit(moments, ellipses[i]) and ellipses[i, 2] <= max_axis_ratio * ellipses[i, 3]):
             shares[i] = 0.0
 
 
 @compiled
 def _fit(moments: FloatArray, ellipse: FloatArray) -> bool:
-    """Fit an ellipse to points given by their sums of xᵖ yᑫ; False if no ellipse fits."""
+    """Fit an ellipse to points given by their sums of xᵖ yᑫ; return False if none fits."""
     linear, inverse = np.empty((3, 3)), np.empty((3, 3))
     mixed, reduce, matrix = np.empty((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
     _fill(moments, linear, mixed)
@@ -73,7 +74,7 @@ def _fit(moments: FloatArray, ellipse: FloatArray) -> bool:
         for j in range(3):
             for k in range(3):
                 reduce[i, j] -= inverse[i, k] * mixed[k, j] / determinant
-    for i in range(3):  # of the constraint 4 ac - b², inverted, times the scatter
+    for i in range(3):  # inverse matrix of the constraint 4 ac - b², times the reduced scatter
         row, factor = 2 - i, (0.5, -1.0, 0.5)[i]
         for j in range(3):
             value = moments[4 - row - j, row + j]
@@ -81,7 +82,7 @@ def _fit(moments: FloatArray, ellipse: FloatArray) -> bool:
                 value += mixed[k, row] * reduce[k, j]
             matrix[i, j] = factor * value
     form, rest = np.empty(3), np.empty(3)
-    _vector_of_largest(matrix, form)
+    _dominant_eigenvector(matrix, form)
     if 4.0 * form[0] * form[2] - form[1] * form[1] <= 0.0:
         return False
     for i in range(3):
@@ -91,7 +92,7 @@ def _fit(moments: FloatArray, ellipse: FloatArray) -> bool:
 
 @compiled
 def _fill(moments: FloatArray, linear: FloatArray, mixed: FloatArray) -> None:
-    """Fill in the scatter of x, y and 1 with each other, and with x², xy and y²."""
+    """Fill in the scatter matrices of x, y, 1 with themselves, and with x², xy, y²."""
     for i in range(3):
         p, q = (i == 0) * 1, (i == 1) * 1
         linear[i, 0], linear[i, 1], linear[i, 2] = (
@@ -108,10 +109,11 @@ def _fill(moments: FloatArray, linear: FloatArray, mixed: FloatArray) -> None:
 
 
 @compiled
-def _vector_of_largest(matrix: FloatArray, vector: FloatArray) -> None:
-    """Fill in an eigenvector (3,) of the largest of three real eigenvalues: in closed form.
+def _dominant_eigenvector(matrix: FloatArray, vector: FloatArray) -> None:
+    """Fill in an eigenvector (3,) of the largest of three real eigenvalues, in closed form.
 
-    The constrained scatter matrix has one non-negative eigenvalue: that of the ellipse.
+    The constrained scatter matrix has a single non-negative eigenvalue, which belongs to the
+    ellipse.
     """
     trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
     minors = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
@@ -151,7 +153,10 @@ def _dot(one: FloatArray, two: FloatArray) -> float:
 
 @compiled
 def _axes(form: FloatArray, rest: FloatArray, ellipse: FloatArray) -> bool:
-    """Return centre, semi-axes and direction of a conic x², xy, y², x, y, 1; False if imaginary."""
+    """Fill in centre, semi-axes and direction of a conic; return False if it is imaginary.
+
+    `form` are its coefficients of x², xy and y², `rest` those of x, y and 1.
+    """
     sign = 1.0 if form[0] + form[2] > 0.0 else -1.0
     a, b, c = sign * form[0], sign * form[1], sign * form[2]
     d, e, f = sign * rest[0], sign * rest[1], sign * rest[2]
@@ -163,5 +168,5 @@ def _axes(form: FloatArray, rest: FloatArray, ellipse: FloatArray) -> bool:
     middle, half = 0.5 * (a + c), 0.5 * math.hypot(a - c, b)
     ellipse[0], ellipse[1] = x, y
     ellipse[2], ellipse[3] = math.sqrt(depth / (middle - half)), math.sqrt(depth / (middle + half))
-    ellipse[4] = 0.5 * math.atan2(-b, c - a)  # of the lesser curvature
+    ellipse[4] = 0.5 * math.atan2(-b, c - a)  # direction of the smaller curvature
     return True

@@ -1,4 +1,4 @@
-"""Which part of its data type's range a frame's grey values take."""
+"""The range of a frame's grey values."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ _BRIGHTEST_QUANTILE = 0.999
 
 
 def full_scale(grey: GreyArray) -> float:
-    """Return the largest grey value of the data type; 1 for floats."""
+    """Return the largest grey value that the data type can hold; 1 for floats."""
     return float(np.iinfo(grey.dtype).max) if np.issubdtype(grey.dtype, np.integer) else 1.0
 
 
 def brightest_level(grey: GreyArray) -> float:
-    """Return what counts as white in a frame: the end of 8 bits, or its own brightest pixels.
+    """Return the grey value that counts as white in a frame.
 
-    A 16-bit frame often holds 10 or 12 bits, so that a share of its data type's range means little.
+    For 16 bits it is a quantile near the brightest pixels, because such frames often hold only 10
+    or 12 bits. Otherwise it is full scale.
     """
     if grey.dtype != np.uint16:
         return full_scale(grey)

@@ -1,4 +1,4 @@
-"""Homographies: perspective maps of a plane."""
+"""Homographies: projective maps of a plane."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 
-_LEAST_DEPTH = 1e-9  # over that of the middle of what it was computed from
+_MIN_DEPTH = 1e-9  # relative to that of the mean of the points that define the homography
 
 
-def homography_between(flat: FloatArray, places: FloatArray) -> FloatArray:
+def homography_between(plane_points: FloatArray, images: FloatArray) -> FloatArray:
     """Return the homography (3, 3) from points (n, 2) of a plane to their images (n, 2).
 
-    It is that of the normalised DLT. The depth of the points' middle is 1.
+    It is computed by the normalised DLT, and scaled so that the mean of the points has the depth 1.
     """
-    to_plane, to_image = _normalising(flat), _normalising(places)
-    x, y = (flat @ to_plane[:2, :2] + to_plane[:2, 2]).T
-    u, v = (places @ to_image[:2, :2] + to_image[:2, 2]).T
+    to_plane, to_image = _normalising(plane_points), _normalising(images)
+    x, y = (plane_points @ to_plane[:2, :2] + to_plane[:2, 2]).T
+    u, v = (images @ to_image[:2, :2] + to_image[:2, 2]).T
     one, zero = np.ones_like(x), np.zeros_like(x)
     rows = np.concatenate(
         (
@@ -26,20 +26,24 @@ def homography_between(flat: FloatArray, places: FloatArray) -> FloatArray:
             np.stack((zero, zero, zero, x, y, one, -v * x, -v * y, -v), axis=1),
         )
     )
-    is_short = len(rows) < rows.shape[1]  # then the last vector is only among all of them
+    is_short = len(rows) < rows.shape[1]  # then only the full SVD contains the null vector
     solved = np.linalg.svd(rows, full_matrices=is_short)[2][-1].reshape(3, 3)
     by_points = np.linalg.inv(to_image) @ solved @ to_plane
-    depth = float(by_points[2] @ (*flat.mean(axis=0), 1.0))
+    depth = float(by_points[2] @ (*plane_points.mean(axis=0), 1.0))
     return np.asarray(by_points / depth if depth else by_points)
 
 
-def mapped(homography: FloatArray, flat: FloatArray) -> FloatArray:
-    """Return the images (n, 2) of points (n, 2) of a plane; far away where they have none."""
-    images = np.column_stack((flat, np.ones(len(flat)))) @ homography.T
-    return np.asarray(images[:, :2] / np.maximum(images[:, 2:], _LEAST_DEPTH))
+def mapped(homography: FloatArray, plane_points: FloatArray) -> FloatArray:
+    """Return the images (n, 2) of points (n, 2) of a plane.
+
+    Points behind the camera have no image: they are mapped to somewhere far away.
+    """
+    images = np.column_stack((plane_points, np.ones(len(plane_points)))) @ homography.T
+    return np.asarray(images[:, :2] / np.maximum(images[:, 2:], _MIN_DEPTH))
 
 
 def _normalising(points: FloatArray) -> FloatArray:
+    """Return the similarity (3, 3) that gives points (n, 2) the mean 0 and an RMS radius of √2."""
     middle = points.mean(axis=0)
     scale = math.sqrt(2.0) / float(np.sqrt(np.mean(np.sum((points - middle) ** 2, axis=1))))
     matrix = np.diag([scale, scale, 1.0])

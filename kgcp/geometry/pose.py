@@ -1,4 +1,4 @@
-"""Rigid poses: target → camera, and the angles that the paper and the table report."""
+"""Poses of a target in the camera frame, and the angles that the paper and the tables report."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from kgcp.geometry._jit import compiled, interpreted
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 
-_SQUARE_VIEW = 1e-9  # sine of the angle between normal and ray below which the two poses are one
+# Sine of the angle between normal and viewing ray below which a view counts as frontal: both poses
+# coincide then.
+_FRONTAL_SINE = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,70 +63,81 @@ class Pose:
         return points_target @ self.rotation[:, :columns].T + self.translation_m
 
     def turned(self, angle_deg: float) -> Pose:
-        """Return this pose with the target turned about its own z axis, from +x towards +y."""
+        """Return the pose after turning the target about its own z axis, from +x towards +y."""
         turn = rotation_about(np.array([0.0, 0.0, math.radians(angle_deg)]))
         return Pose(self.rotation @ turn, self.translation_m)
 
     def moved(self, step: FloatArray) -> Pose:
-        """Return the pose after a small step (6,): translation [m], left rotation vector [rad]."""
+        """Return the pose after a step (6,): translation [m], rotation vector [rad].
+
+        Both are in the camera frame; the rotation is applied from the left.
+        """
         turn = _rotation_about_few(step[3:6])
         return Pose(turn @ self.rotation, self.translation_m + step[:3])
 
     def mirrored(self) -> Pose:
         """Return the pose with the plate's normal mirrored about the viewing ray of its centre.
 
-        The least turn that does it: about the axis square to both, by twice their angle.
+        It is reached by the smallest possible rotation: about the axis perpendicular to normal and
+        ray, by twice the angle between them.
         """
         (a, b, c), (x, y, z) = self.normal.tolist(), self.translation_m.tolist()
         axis = np.array([b * z - c * y, c * x - a * z, a * y - b * x])
         sine, cosine = math.hypot(*axis), a * x + b * y + c * z
-        if sine < _SQUARE_VIEW * self.distance_m:
+        if sine < _FRONTAL_SINE * self.distance_m:
             return self
         turn = rotation_about(axis / sine * 2.0 * math.atan2(sine, cosine))
         return Pose(turn @ self.rotation, self.translation_m)
 
-    def tilted(self, least_rad: float) -> Pose:
-        """Return the pose with its normal turned away from the centre's ray, if it is nearer.
+    def tilted(self, min_tilt_rad: float) -> Pose:
+        """Return the pose with a tilt against the centre's viewing ray of at least this angle.
 
-        In its own direction; where it has none, in any.
+        The direction of the tilt is kept; a frontal pose is tilted in an arbitrary direction.
         """
         axis, tilt_rad = self._tilt()
-        turn = rotation_about(max(0.0, least_rad - tilt_rad) * axis)
+        turn = rotation_about(max(0.0, min_tilt_rad - tilt_rad) * axis)
         return Pose(turn @ self.rotation, self.translation_m)
 
     def tilted_across(self, angle_rad: float) -> Pose:
-        """Return the pose with its normal turned away from the ray square to where it is turned."""
+        """Return the pose tilted by an angle perpendicular to the present direction of the tilt.
+
+        The angle is that between the new normal and the centre's viewing ray.
+        """
         axis, tilt_rad = self._tilt()
         across = np.cross(self.translation_m, axis) / self.distance_m
         turn = rotation_about(angle_rad * across) @ rotation_about(-tilt_rad * axis)
         return Pose(turn @ self.rotation, self.translation_m)
 
     def _tilt(self) -> tuple[FloatArray, float]:
-        """Return about which unit axis the normal is off the ray, any if none, and how far."""
+        """Return axis and angle [rad] of the rotation from the centre's viewing ray to the normal.
+
+        The axis (3,) is a unit vector; for a frontal pose, an arbitrary one perpendicular to the
+        ray.
+        """
         (a, b, c), (x, y, z) = self.normal.tolist(), self.translation_m.tolist()
         distance = math.sqrt(x * x + y * y + z * z)
         x, y, z = x / distance, y / distance, z / distance
         axis = y * c - z * b, z * a - x * c, x * b - y * a
         sine = math.hypot(*axis)
         tilt_rad = math.atan2(sine, a * x + b * y + c * z)
-        if sine < _SQUARE_VIEW:
+        if sine < _FRONTAL_SINE:
             axis = 0.0, z, -y
             sine = math.hypot(*axis)
         return np.array(axis) / sine, tilt_rad
 
     @property
     def roll_deg(self) -> float:
-        """φ of the paper's eq. 11: tilt of the diameter in the camera's yz plane; 0 for R = I.
+        """φ of the paper's eq. 11: tilt of a diameter in the camera's yz plane; 0 for R = I.
 
-        The diameter of the plate that is parallel to the camera's yz plane has the direction
-        d ∝ n × e_x (n: plate normal); φ = atan2(d_z, d_y) with d_y > 0.
+        It is the diameter of the plate that is parallel to the camera's yz plane. With the plate's
+        normal n its direction is d ∝ n × e_x, and φ = atan2(d_z, d_y) with d_y > 0.
         """
         n = self.normal
         return math.degrees(math.atan2(-n[1], n[2]))
 
     @property
     def pitch_deg(self) -> float:
-        """θ of the paper: tilt of the diameter in the camera's xz plane; 0 for R = I."""
+        """θ of the paper: tilt of the diameter parallel to the camera's xz plane; 0 for R = I."""
         n = self.normal
         return math.degrees(math.atan2(-n[0], n[2]))
 
@@ -133,7 +146,7 @@ class Pose:
 def rotation_about(vector: FloatArray) -> FloatArray:
     """Return the rotation matrix (3, 3) of a rotation vector (3,) [rad], by Rodrigues' formula.
 
-    Adjustments take many small turns: the overhead of a general library would show.
+    Compiled, because adjustments make many small rotations and a general library takes longer.
     """
     x, y, z = vector[0], vector[1], vector[2]
     square = x * x + y * y + z * z
@@ -151,14 +164,14 @@ def rotation_about(vector: FloatArray) -> FloatArray:
     )
 
 
-_rotation_about_few = interpreted(rotation_about)  # the program itself takes a turn per frame
+_rotation_about_few = interpreted(rotation_about)  # called once per frame: not worth compiling
 
 
 def image_heading_deg(camera: Camera, pose: Pose) -> float:
-    """Direction of the target's +x axis in the raw image, at the projected centre.
+    """Return the direction of the target's +x axis in the raw image [deg], in (-180, 180].
 
-    Clockwise from image x, in (-180, 180] [deg]: the derivative of the distorted projection
-    along the axis, so independent of any length on the plate.
+    It is measured clockwise from image x, at the projected centre. As the derivative of the
+    distorted projection along the axis, it does not depend on a length on the plate.
     """
     centre, axis = pose.translation_m, pose.rotation[:, 0]
     normalised = centre[:2] / centre[2]

@@ -17,7 +17,7 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle import circle_planes
-from kgcp.geometry.circle_image import Circles3D, circle_slopes
+from kgcp.geometry.circle_image import Circles3D, circle_derivatives
 from kgcp.geometry.conic import Ellipse, fit_ellipse
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.image_model.rolling_shutter import motion_per_row
@@ -147,7 +147,7 @@ def _equations(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return weighted residuals (5k + 2,), design matrix (5k + 2, 5) and axes of the two tilts."""
     circles = circles_about(pose, images.radii_m)
-    slopes = circle_slopes(camera, circles)
+    slopes = circle_derivatives(camera, circles)
     axes = pose.rotation[:, :2]
     off = images.moments - slopes.moments
     if not np.isfinite(off).all():

@@ -12,7 +12,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import cross_matrix
-from kgcp.geometry.calibration import CalibrationCovariance, image_by_calibration
+from kgcp.geometry.calibration import CalibrationCovariance, distort_jacobian_by_calibration
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.records import CommonUncertainty
@@ -81,8 +81,8 @@ def pose_by_calibration(camera: Camera, radius_m: float, pose: Pose) -> FloatArr
     by_pose = np.concatenate((by_point, by_point @ by_turn), axis=2)
     along_circle = np.stack((-sine, cosine), axis=-1) @ pose.rotation[:, :2].T
     weigh = _edge_weights((by_point @ along_circle[:, :, None])[:, :, 0])
-    by_calibration = weigh @ image_by_calibration(camera, normalised)
-    # the columns of the translation are scaled, to be comparable with those of the rotation
+    by_calibration = weigh @ distort_jacobian_by_calibration(camera, normalised)
+    # Metres and radians: the first three columns are scaled to be comparable with the others.
     scale = np.array([*(pose.distance_m,) * 3, 1.0, 1.0, 1.0])
     design = (weigh @ by_pose).reshape(-1, 6) * scale
     moved = np.linalg.lstsq(design, by_calibration.reshape(2 * _POINTS, -1), rcond=None)[0]

@@ -8,7 +8,7 @@ import numpy as np
 
 from kgcp.errors import SettingError
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, image_by_calibration
+from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, distort_jacobian_by_calibration
 from kgcp.geometry.camera import Camera
 from kgcp.network.records import ImageSlopes
 
@@ -59,7 +59,7 @@ class FrameCameraModel:
         return ImageSlopes(
             camera.distort(normalised),
             camera.distort_jacobian(normalised),
-            image_by_calibration(camera, normalised) @ self.to_calibration(),
+            distort_jacobian_by_calibration(camera, normalised) @ self.to_calibration(),
         )
 
     def to_calibration(self) -> FloatArray:

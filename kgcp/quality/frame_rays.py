@@ -14,7 +14,7 @@ from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.calibration import (
     CALIBRATION_PARAMETERS,
     CalibrationCovariance,
-    image_by_calibration,
+    distort_jacobian_by_calibration,
 )
 from kgcp.geometry.camera import Camera
 
@@ -83,7 +83,7 @@ class _Rays:
 def ray_deviations_px(camera: Camera, covariance: CalibrationCovariance) -> FloatArray:
     """Return the standard deviation (h, w) of every ray of a grid over the frame [px]."""
     rays = _Rays.of(camera)
-    by_camera = image_by_calibration(camera, rays.normalised)
+    by_camera = distort_jacobian_by_calibration(camera, rays.normalised)
     left = rays.without_turn(by_camera).reshape(-1, len(CALIBRATION_PARAMETERS))
     variances = np.einsum("ij,jk,ik->i", left, covariance.cov, left)
     sd = np.sqrt(np.maximum(variances, 0.0).reshape(-1, 2).sum(axis=1))

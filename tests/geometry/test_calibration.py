@@ -12,7 +12,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.calibration import (
     CALIBRATION_PARAMETERS,
     CalibrationCovariance,
-    image_by_calibration,
+    distort_jacobian_by_calibration,
 )
 from kgcp.geometry.camera import Camera
 
@@ -43,7 +43,7 @@ def test_derivatives_are_those_of_the_camera(name: str) -> None:
         for sign in (1.0, -1.0)
     )
     column = CALIBRATION_PARAMETERS.index(name)
-    derivative = image_by_calibration(CAMERA, points)[:, :, column]
+    derivative = distort_jacobian_by_calibration(CAMERA, points)[:, :, column]
     assert np.allclose(derivative, (high - low) / (2.0 * step), rtol=1e-5, atol=1e-6)
 
 

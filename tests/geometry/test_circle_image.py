@@ -12,12 +12,12 @@ from kgcp.geometry.calibration import CALIBRATION_PARAMETERS
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle import conic_of_circle
 from kgcp.geometry.circle_image import (
+    CircleDerivatives,
     Circles3D,
-    CircleSlopes,
+    circle_derivatives,
     circle_images,
-    circle_slopes,
     eccentricity,
-    moments_by_calibration,
+    moments_jacobian_by_calibration,
 )
 from kgcp.geometry.conic import ellipse_from_conic
 from kgcp.geometry.pose import Pose, rotation_about
@@ -95,7 +95,7 @@ def test_split_adds_up() -> None:
     assert CAMERA.project(CENTRES) == pytest.approx(split.centres_px, abs=1e-9)
 
 
-def moved(slopes: CircleSlopes) -> dict[str, tuple[FloatArray, FloatArray]]:
+def moved(slopes: CircleDerivatives) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Derivatives, and the same by central differences."""
     start, step, pairs = circles(), 1e-6, {}
 
@@ -116,7 +116,7 @@ def moved(slopes: CircleSlopes) -> dict[str, tuple[FloatArray, FloatArray]]:
         pairs[f"rotation {k}"] = slopes.by_rotation[..., k], numeric
     numeric = difference(at(radii_m=RADII + step), at(radii_m=RADII - step))
     pairs["radius"] = slopes.by_radius, numeric
-    by_calibration = moments_by_calibration(CAMERA, start)
+    by_calibration = moments_jacobian_by_calibration(CAMERA, start)
     for k, name in enumerate(CALIBRATION_PARAMETERS):
         value = getattr(CAMERA, name)
         more, less = (
@@ -128,7 +128,7 @@ def moved(slopes: CircleSlopes) -> dict[str, tuple[FloatArray, FloatArray]]:
 
 
 def test_derivatives_are_those_of_the_moments() -> None:
-    slopes = circle_slopes(CAMERA, circles())
+    slopes = circle_derivatives(CAMERA, circles())
     assert np.array_equal(slopes.moments, circle_images(CAMERA, circles()).moments)
     for name, (analytic, numeric) in moved(slopes).items():
         scale = np.abs(numeric).max(axis=0)
@@ -144,4 +144,4 @@ def test_a_circle_endlessly_far_has_no_image() -> None:
     """Its moments would be those of rounding."""
     far = Circles3D(np.array([[0.0, 0.0, 1e20]]), circles().axes[:1], RADII[:1])
     assert np.isnan(circle_images(CAMERA, far).moments).all()
-    assert np.isnan(circle_slopes(CAMERA, far).by_centre).any()
+    assert np.isnan(circle_derivatives(CAMERA, far).by_centre).any()

@@ -32,7 +32,7 @@ def there_and_back(module: ModuleType, points: FloatArray) -> tuple[FloatArray, 
     pixels, back, slopes = np.empty_like(points), np.empty_like(points), np.empty((len(points), 4))
     module.distort_points(LENS, SCALE, points, pixels)
     module.undistort_points(LENS, SCALE, module.first_fold_r2(LENS), pixels, back)
-    module.distort_slopes(LENS, SCALE, points, slopes.reshape(-1, 2, 2))
+    module.fill_in_jacobians(LENS, SCALE, points, slopes.reshape(-1, 2, 2))
     return pixels, back, slopes
 
 

@@ -9,7 +9,7 @@ from scipy.special import fdtri
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.geometry.circle_image import circle_slopes
+from kgcp.geometry.circle_image import circle_derivatives
 from kgcp.network.ground.space_circle import CircleViews, SpaceCircle
 
 LEAST_SIDE = 3
@@ -62,7 +62,7 @@ def best_split(
     """
     count = len(views)
     circles = circle.in_cameras(views)
-    slopes = circle_slopes(camera, circles)
+    slopes = circle_derivatives(camera, circles)
     residuals = (views.moments - slopes.moments)[:, :2]
     design = slopes.by_centre[:, :2]
     design = design @ np.swapaxes(views.world_from_camera, 1, 2)

@@ -19,7 +19,7 @@ from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.geometry.camera import Camera
-from kgcp.geometry.circle_image import Circles3D, circle_slopes
+from kgcp.geometry.circle_image import Circles3D, circle_derivatives
 from kgcp.geometry.pose import Pose
 from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.local_frame import LocalFrame
@@ -380,7 +380,7 @@ def ring_images(
     radius_m : float
         Of the circle that was assumed.
     """
-    slopes = circle_slopes(camera, _circles(poses, radius_m))
+    slopes = circle_derivatives(camera, _circles(poses, radius_m))
     by_pose = np.concatenate((slopes.by_centre, slopes.by_rotation), axis=2)
     cov = by_pose @ np.array(pose_covs) @ np.swapaxes(by_pose, 1, 2)
     return slopes.moments, _with_floor(slopes.moments, cov)

@@ -22,7 +22,11 @@ from scipy import optimize
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.camera import Camera
-from kgcp.geometry.circle_image import circle_images, circle_slopes, moments_by_calibration
+from kgcp.geometry.circle_image import (
+    circle_derivatives,
+    circle_images,
+    moments_jacobian_by_calibration,
+)
 from kgcp.network.ground.circle_start import circle_starts
 from kgcp.network.ground.moved_circle import Split
 from kgcp.network.ground.space_circle import (
@@ -237,13 +241,15 @@ def common_covariance(
     """
     kept = views.chosen(fit.is_used)
     circles = fit.circle.in_cameras(kept)
-    slopes = circle_slopes(camera, circles)
+    slopes = circle_derivatives(camera, circles)
     weights = np.linalg.inv(total_covariances(camera, kept, fit.circle, noise))
     design = _design(kept, fit.circle, slopes.by_centre, slopes.by_rotation, slopes.by_radius)
     gain = fit.cov @ np.einsum("nmp,nmk->npk", design, weights).transpose(1, 0, 2).reshape(6, -1)
     common = np.zeros((6, 6))
     if calibration_cov is not None:
-        by_calibration = moments_by_calibration(camera, circles).reshape(-1, len(calibration_cov))
+        by_calibration = moments_jacobian_by_calibration(camera, circles).reshape(
+            -1, len(calibration_cov)
+        )
         by_calibration = -gain @ by_calibration
         common += by_calibration @ calibration_cov @ by_calibration.T
     # a displacement δ along the whole outline changes the mean moment a²/4 by a δ / 2
@@ -383,7 +389,7 @@ def _normal_equations(
 ) -> tuple[FloatArray, FloatArray]:
     """Return normal matrix (6, 6) and right-hand side (6,)."""
     circles = circle.in_cameras(views)
-    slopes = circle_slopes(camera, circles)
+    slopes = circle_derivatives(camera, circles)
     design = _design(views, circle, slopes.by_centre, slopes.by_rotation, slopes.by_radius)
     residuals = views.moments - slopes.moments
     weighted = np.linalg.solve(covs, design)
@@ -431,7 +437,7 @@ def _moments_by_exterior(camera: Camera, views: CircleViews, circle: SpaceCircle
     With R' = exp(ω) R and C' = C + δ, the circle moves in the camera's frame by
     Rᵀ((X − C) × ω − δ), and turns by −Rᵀ ω.
     """
-    slopes = circle_slopes(camera, circle.in_cameras(views))
+    slopes = circle_derivatives(camera, circle.in_cameras(views))
     camera_from_world = np.swapaxes(views.world_from_camera, 1, 2)
     by_place = slopes.by_centre @ camera_from_world
     by_turn = by_place @ cross_matrix(circle.centre_m - views.camera_m)

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, image_by_calibration
+from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, distort_jacobian_by_calibration
 from kgcp.geometry.camera import Camera
 from kgcp.network.calibration_records import CameraCalibration, PointModel
 from kgcp.network.records import Estimate
@@ -123,7 +123,7 @@ def _distortion(calibration: CameraCalibration) -> Picture:
     ideal = radius * camera.fx
     displaced = camera.distort(along)[:, 0] - camera.cx - ideal
     terms = [CALIBRATION_PARAMETERS.index(name) for name in ("k1", "k2", "k3", "k4", "k5", "k6")]
-    slopes = image_by_calibration(camera, along)[:, 0][:, terms]
+    slopes = distort_jacobian_by_calibration(camera, along)[:, 0][:, terms]
     cov = calibration.covariance.cov[np.ix_(terms, terms)]
     sd = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", slopes, cov, slopes), 0.0))
     with sheet(3.8) as figure:
