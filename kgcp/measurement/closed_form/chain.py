@@ -1,4 +1,4 @@
-"""From a matched ring to a pose by closed forms: §2.4, §4 and §3 of Cucci (2016), in turn."""
+"""From a ring with the right code to a pose in closed form: §2.4, §4 and §3 of Cucci (2016)."""
 
 from __future__ import annotations
 
@@ -33,18 +33,20 @@ from kgcp.measurement.search.code_signal import (
 from kgcp.measurement.search.sampling import sample_grey
 from kgcp.targets.layout import Ring, Target
 
+# Of each pair of limits, the larger one applies. The second of a pair is relative to the outer
+# radius.
 _MAX_EDGE_SHIFT_PX = 1.2
-_MAX_EDGE_SHIFT_SHARE = 0.02  # of the outer radius
+_MAX_EDGE_SHIFT_SHARE = 0.02
 _MAX_CENTRE_MISFIT_PX = 0.6
-_MAX_CENTRE_MISFIT_SHARE = 0.04  # of the outer radius
+_MAX_CENTRE_MISFIT_SHARE = 0.04
 _MAX_TILT_DEG = 75.0
-_MAX_DETOUR_PX = 0.05
+_MAX_DETOUR_PX = 0.05  # from one known minimum of D to the other, via the one that was found
 _SAME_POSE_RAD = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RingEdges:
-    """Both edges of one ring: all that is measured in the image (end of §2.4)."""
+    """The two edges of a ring: all that is measured in the image (end of §2.4)."""
 
     outer: EdgeFit
     inner: EdgeFit
@@ -52,22 +54,22 @@ class RingEdges:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedRing:
-    """One of the two poses that explain the outer circle, with what the rest says of it."""
+    """One of the two poses that explain the outer circle, compared with code and inner circle."""
 
     pose: Pose  # target → camera
-    score: float  # normalised cross-correlation of the code seen with this pose
-    # distance of the inner ellipse's centre from where this pose puts it [px]
+    score: float  # normalised cross-correlation of the code, sampled with this pose
+    # distance [px] between the measured centre of the inner ellipse and that predicted by this pose
     centre_misfit_px: float
 
 
 def measure_ring(grey: GreyArray, camera: Camera, target: Target, match: CodeMatch) -> Measurement:
-    """Measure one matched ring by the paper's chain; instance 0.
+    """Measure one matched ring by the paper's method; its `instance` is 0.
 
     Raises
     ------
     Rejection
-        Where the chain breaks: NO_INNER_CIRCLE, EDGES_LOST, POOR_ELLIPSE, CODE_MISMATCH or
-        IMPOSSIBLE_GEOMETRY.
+        NO_INNER_CIRCLE, EDGES_LOST, POOR_ELLIPSE, CODE_MISMATCH or IMPOSSIBLE_GEOMETRY, depending
+        on the step that fails.
     """
     edges = measure_edges(grey, camera, match)
     nearest, mirrored = solve_poses(grey, camera, match, edges)
@@ -75,7 +77,7 @@ def measure_ring(grey: GreyArray, camera: Camera, target: Target, match: CodeMat
     _check_geometry(nearest, edges.outer, shift_px)
     turn = nearest.pose.rotation.T @ mirrored.pose.rotation
     alternative = Alternative(mirrored.pose, mirrored.centre_misfit_px - nearest.centre_misfit_px)
-    distinct = np.linalg.norm(turn - np.eye(3)) > _SAME_POSE_RAD
+    is_distinct = np.linalg.norm(turn - np.eye(3)) > _SAME_POSE_RAD
     return Measurement(
         target=target.name,
         ring=match.ring.name,
@@ -85,7 +87,7 @@ def measure_ring(grey: GreyArray, camera: Camera, target: Target, match: CodeMat
         centre_px=camera.project(nearest.pose.translation_m),
         heading_deg=image_heading_deg(camera, nearest.pose),
         appearance=_appearance(grey, target, match, edges.outer.ellipse, shift_px),
-        alternative=alternative if distinct else None,
+        alternative=alternative if is_distinct else None,
         uncertainty=None,
     )
 
@@ -93,8 +95,8 @@ def measure_ring(grey: GreyArray, camera: Camera, target: Target, match: CodeMat
 def measure_edges(grey: GreyArray, camera: Camera, match: CodeMatch) -> RingEdges:
     """Fit the outer ellipse, then the inner one (§2.4).
 
-    Blur and overexposure can join the dots to the disc so that no contour follows the inner
-    circle. The poses of the outer circle say where to look for its edge points.
+    Blur and overexposure can join the dots with the disc, so that no contour follows the inner
+    circle. Therefore the two poses of the outer circle predict where its edge points are searched.
     """
     ring = match.ring
     patch = spline_patch_around(grey, match.outer)
@@ -127,7 +129,7 @@ def measure_edges(grey: GreyArray, camera: Camera, match: CodeMatch) -> RingEdge
 
 
 def _inner_circles(camera: Camera, outer: EdgeFit, ring: Ring) -> list[Ellipse]:
-    """Return where either pose of the outer circle puts the inner one [px]."""
+    """Return the inner ellipses that the two poses of the outer circle predict [px]."""
     towards = camera.undistort(outer.ellipse.points(np.zeros(1)))[0]
     angles = CODE_ANGLES_RAD[::10]
     circle_m = 0.5 * ring.inner_diameter_m * np.stack((np.cos(angles), np.sin(angles)), axis=-1)
@@ -143,11 +145,11 @@ def _inner_circles(camera: Camera, outer: EdgeFit, ring: Ring) -> list[Ellipse]:
 def solve_poses(
     grey: GreyArray, camera: Camera, match: CodeMatch, edges: RingEdges
 ) -> tuple[PosedRing, PosedRing]:
-    """Solve for the projected centre and the poses (§4, §3); the better one comes first.
+    """Solve for the projected centre and the two poses (§4, §3); the better pose comes first.
 
-    Kim's centre of the two ellipses starts the minimisation of D (eq. 14). Both minima are known
-    in closed form: the minimisation must end at one of them, which makes sure of the geometry,
-    and the inner ellipse, by its centre, decides which of the two is taken.
+    Kim's centre of the two ellipses is the start of the minimisation of D (eq. 14). Both minima are
+    known in closed form. The minimisation must end at one of them, as a check of the geometry. The
+    better pose is the one whose predicted inner ellipse has its centre closer to the measured one.
     """
     outer = edges.outer.conic
     first, second = circle_planes(outer)
@@ -161,8 +163,9 @@ def solve_poses(
 def _check_minimum(
     centre: FloatArray, first: CirclePlane, second: CirclePlane, focal_px: float
 ) -> None:
-    """Refuse a minimum of D that is neither of the two that exist, nor in the valley between."""
+    """Reject a minimum of D that is neither at one of the two known minima nor between them."""
     apart = float(np.linalg.norm(first.image_centre - second.image_centre))
+    # by how much the way from one known minimum to the other is longer via `centre`
     detour = sum(float(np.linalg.norm(centre - p.image_centre)) for p in (first, second)) - apart
     if not focal_px * detour < _MAX_DETOUR_PX:
         raise Rejection(
@@ -186,10 +189,10 @@ def _posed(
 
 
 def edge_shift_px(pose: Pose, ring: Ring, edges: RingEdges) -> float:
-    """Return δ [px], the displacement of both edges towards the dark ring.
+    """Return δ [px], by which both edges are displaced towards the dark ring.
 
-    With r_o = R - δ and r_i = kR + δ: δ = (r_i - k r_o) / (1 + k), the inner radius taken on the
-    plate so that the perspective of a tilted ring does not count.
+    From r_o = R - δ and r_i = kR + δ follows δ = (r_i - k r_o) / (1 + k). The inner radius is
+    measured on the plate, so that the perspective of a tilted ring has no effect.
     """
     inner_m = ellipse_from_conic(conic_on_plate(pose, edges.inner.conic)).mean_radius
     k, outer_m = ring.inner_ratio, 0.5 * ring.outer_diameter_m
@@ -198,7 +201,7 @@ def edge_shift_px(pose: Pose, ring: Ring, edges: RingEdges) -> float:
 
 
 def _check_geometry(posed: PosedRing, outer: EdgeFit, shift_px: float) -> None:
-    """Refuse ellipses that cannot be one target's circles."""
+    """Reject ellipses that cannot be the circles of one target."""
     radius_px = outer.ellipse.a
     limit_px = max(_MAX_EDGE_SHIFT_PX, _MAX_EDGE_SHIFT_SHARE * radius_px)
     if abs(shift_px) > limit_px:
@@ -232,13 +235,13 @@ def _appearance(
 
 
 def _saturated_share(grey: GreyArray, outer: Ellipse) -> float:
-    """Share of the pixels within an ellipse that are at the top of the grey values' range."""
+    """Return the share of the pixels within an ellipse that have the largest grey value."""
     rows = np.arange(max(0, int(outer.y - outer.a)), min(grey.shape[0], int(outer.y + outer.a) + 2))
     columns = np.arange(
         max(0, int(outer.x - outer.a)), min(grey.shape[1], int(outer.x + outer.a) + 2)
     )
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
     unit = (pixels - outer.centre) @ np.linalg.inv(outer.stretch)
-    inside = np.einsum("...i,...i->...", unit, unit) <= 1.0
-    values = grey[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1][inside]
+    is_inside = np.einsum("...i,...i->...", unit, unit) <= 1.0
+    values = grey[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1][is_inside]
     return float(np.mean(values == full_scale(grey))) if values.size else 0.0

@@ -1,4 +1,4 @@
-"""Nearly circular contours and clusters of concentric ones: §2.2 of Cucci (2016)."""
+"""Nearly circular contours, and clusters of concentric ones: §2.2 of Cucci (2016)."""
 
 from __future__ import annotations
 
@@ -12,20 +12,23 @@ from kgcp.geometry.conic import Ellipse, ellipse_from_conic, fit_ellipse, sampso
 from kgcp.measurement.closed_form.contours import Contours, circular_hulls, find_contours
 from kgcp.settings import DetectSettings
 
-_MAX_ROUGH_DEVIATION = 0.45  # of the mean radius: an arc has more
+# Standard deviation of the radius, relative to its mean, up to which the convex hull of a rough
+# contour is tested. Open arcs have more.
+_MAX_ROUGH_DEVIATION = 0.45
 _FIT_PASSES = 3
-_MAX_AXIS_RATIO = 2.0  # tilts to 60°
-_CONCENTRIC = 0.2  # of the smaller circle's radius
+_MAX_AXIS_RATIO = 2.0  # corresponds to a tilt of 60°
+# Largest distance of the centres of concentric circles: 1 px plus 0.2 of the smaller radius.
+_CONCENTRIC = 0.2
 _CONCENTRIC_PX = 1.0
-_SAME_CIRCLE_PX = 0.7
-_TWIN_RADIUS_PX = 1.1
+_SAME_CIRCLE_PX = 0.7  # difference of centre coordinates and semi-axes below which circles are one
+_TWIN_RADIUS_PX = 1.1  # difference in radius of the contours on the two sides of a thin edge
 
 
 def paper_outlines(grey: GreyArray, settings: DetectSettings) -> tuple[Ellipse, ...]:
-    """Return what the paper's search takes for rings: §2.1 and §2.2 in turn.
+    """Return the ellipses that may be rings according to §2.1 and §2.2 of the paper.
 
-    The paper tests the largest circle of each cluster for its code. A shadow or the plate's own
-    outline can be concentric and larger, so that here every member is tested.
+    The paper tests only the largest circle of each cluster for the code. Here every member is
+    tested, because a shadow or the outline of the plate can be concentric and larger.
     """
     clusters = concentric_clusters(near_circular(find_contours(grey, settings), settings))
     return tuple(ellipse for cluster in clusters for ellipse in cluster)
@@ -34,10 +37,12 @@ def paper_outlines(grey: GreyArray, settings: DetectSettings) -> tuple[Ellipse, 
 def near_circular(contours: Contours, settings: DetectSettings) -> tuple[Ellipse, ...]:
     """Return the contours that pass the paper's circle test, as ellipses [px].
 
-    With the mean μ and the standard deviation σ of the radius about the contour's mean point a
-    contour passes if μ > μ_min and σ < k μ. Where blur or overexposure open the dots towards the
-    plate, the contour runs through them into the ring: of a contour long enough to go round, but
-    too rough to pass, the convex hull is tested in its place.
+    With μ and σ the mean and the standard deviation of the radius about the contour's mean point, a
+    contour passes if μ > μ_min and σ < k μ.
+
+    Blur or overexposure can open the dots towards the plate. Then the contour runs through the dots
+    into the ring. Therefore the convex hull is tested in place of a contour that is too rough to
+    pass but long enough to surround a ring.
     """
     if len(contours) == 0:
         return ()
@@ -52,15 +57,15 @@ def near_circular(contours: Contours, settings: DetectSettings) -> tuple[Ellipse
     rough = ~circular & (deviation < _MAX_ROUGH_DEVIATION * mean)
     rough &= counts > 2.0 * math.pi * settings.min_radius_px
     candidates = np.flatnonzero(circular)
-    single = _one_per_edge(centres[candidates], mean[candidates])
+    single = _without_twins(centres[candidates], mean[candidates])
     curves = [contours.contour(int(index)) for index in candidates[single]]
     curves += circular_hulls(contours.chosen(np.flatnonzero(rough)), settings)
     fits = (_preliminary_ellipse(curve) for curve in curves)
     return tuple(ellipse for ellipse in fits if ellipse is not None)
 
 
-def _one_per_edge(centres: FloatArray, mean_radii: FloatArray) -> IndexArray:
-    """Return the indices of circles without their smaller twins: an edge has a contour a side."""
+def _without_twins(centres: FloatArray, mean_radii: FloatArray) -> IndexArray:
+    """Return the indices of one circle per edge, the larger: an edge has a contour on each side."""
     kept: list[int] = []
     for index in np.argsort(-mean_radii, kind="stable"):
         near = np.abs(centres[kept] - centres[index]).max(axis=1) < _SAME_CIRCLE_PX
@@ -70,7 +75,7 @@ def _one_per_edge(centres: FloatArray, mean_radii: FloatArray) -> IndexArray:
 
 
 def _preliminary_ellipse(points: FloatArray) -> Ellipse | None:
-    """Fit an ellipse to one contour, leaving out where dots or clutter break into it."""
+    """Fit an ellipse to a contour robustly: without parts where dots or clutter break into it."""
     try:
         conic = fit_ellipse(points)
         for _ in range(_FIT_PASSES):
@@ -88,21 +93,21 @@ def _preliminary_ellipse(points: FloatArray) -> Ellipse | None:
 def concentric_clusters(ellipses: tuple[Ellipse, ...]) -> tuple[tuple[Ellipse, ...], ...]:
     """Group ellipses with a common centre, the largest of each group first.
 
-    Both contours along one edge are one circle: of ellipses that agree within a pixel's fraction
-    the larger is kept.
+    The contours on both sides of an edge give nearly the same ellipse. Of ellipses that agree to a
+    fraction of a pixel only the larger is kept.
     """
     if not ellipses:
         return ()
     ordered = sorted(ellipses, key=lambda ellipse: (-ellipse.mean_radius, ellipse.x, ellipse.y))
     centres = np.array([ellipse.centre for ellipse in ordered])
     reach = _CONCENTRIC_PX + _CONCENTRIC * np.array([ellipse.mean_radius for ellipse in ordered])
-    free = np.ones(len(ordered), dtype=bool)
+    is_free = np.ones(len(ordered), dtype=bool)
     clusters = []
     for first in range(len(ordered)):
-        if not free[first]:
+        if not is_free[first]:
             continue
-        members = free & (np.linalg.norm(centres - centres[first], axis=1) <= reach)
-        free &= ~members
+        members = is_free & (np.linalg.norm(centres - centres[first], axis=1) <= reach)
+        is_free &= ~members
         clusters.append(_distinct([ordered[i] for i in np.flatnonzero(members)]))
     return tuple(clusters)
 

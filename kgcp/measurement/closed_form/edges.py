@@ -1,4 +1,4 @@
-"""Sub-pixel edge points and the ellipses through them: §2.4 of Cucci (2016)."""
+"""Sub-pixel edge points, and ellipses fitted to them: §2.4 of Cucci (2016)."""
 
 from __future__ import annotations
 
@@ -15,40 +15,42 @@ from kgcp.measurement.search.code_signal import clear_of_dots
 from kgcp.measurement.search.sampling import FAINTEST_SLOPE
 from kgcp.targets.layout import Ring
 
-_OFFSETS_PX = np.array([-1.5, -0.5, 0.5, 1.5])
+_OFFSETS_PX = np.array([-1.5, -0.5, 0.5, 1.5])  # of the four samples across an edge
 _CUBIC_FROM_SAMPLES = np.linalg.inv(np.vander(_OFFSETS_PX, 4, increasing=True))
-_SEARCH_PX = np.arange(-2.5, 2.75, 0.25)
-_MAX_SHIFT_PX = 1.5
-_MIN_SLOPE = 0.3  # of the median slope along the contour
+_SEARCH_PX = np.arange(-2.5, 2.75, 0.25)  # changes of the radius that `steepest_ellipse` tries
+_MAX_SHIFT_PX = 1.5  # of an edge point from the ellipse
+_MIN_SLOPE = 0.3  # relative to the median slope along the contour
 _PASSES = 3
 _MARGIN_PX = 8
 _MIN_POINTS = 8
-_MIN_SHARE = 0.25  # of the contour's length
-_OUTLIER = 3.0  # of the residuals' standard deviation
+_MIN_SHARE = 0.25  # of the sampled places that must give an edge point
+_OUTLIER_SIGMAS = 3.0  # in standard deviations of the residuals
 _MIN_OUTLIER_PX = 0.1
+# RMS residual that is accepted: the larger of the two. The second is relative to the radius,
+# because the raw image of a large circle is not quite an ellipse.
 _MAX_RMS_PX = 0.35
-_MAX_RMS_SHARE = 0.005  # of the radius: the raw image of a large circle is not quite an ellipse
+_MAX_RMS_SHARE = 0.005
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeFit:
-    """One circle's edge, measured."""
+    """The measured edge of one circle."""
 
     points_px: FloatArray  # (n, 2): sub-pixel edge points in the raw frame [px]
-    ellipse: Ellipse  # through them, in the raw frame [px]
-    conic: FloatArray  # (3, 3): through them in normalised coordinates, free of distortion
+    ellipse: Ellipse  # fitted to them in the raw frame [px]
+    conic: FloatArray  # (3, 3): fitted to them in normalised coordinates, free of distortion
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SplinePatch:
-    """A part of the frame as a cubic spline, in the frame's pixel coordinates."""
+    """A part of the frame as a cubic spline, addressed by pixel coordinates of the frame."""
 
     spline: FloatArray
     left: int
     top: int
 
     def sample(self, points: FloatArray) -> FloatArray:
-        """Interpolate grey values (…) at points (…, 2) of the frame [px]; NaN outside."""
+        """Interpolate grey values (…) at points (…, 2) of the frame [px]; NaN outside the patch."""
         from scipy import ndimage
 
         rows, columns = points[..., 1] - self.top, points[..., 0] - self.left
@@ -60,14 +62,14 @@ class SplinePatch:
 
 
 def spline_patch_around(grey: GreyArray, ellipse: Ellipse) -> SplinePatch:
-    """Cut out what the edge points of `ellipse`, and of any smaller one inside, can need."""
+    """Cut out the part of a frame that edge points of `ellipse`, and of those inside, may need."""
     reach = ellipse.a + _MARGIN_PX
     left, top = max(0, int(ellipse.x - reach)), max(0, int(ellipse.y - reach))
     right, bottom = int(ellipse.x + reach) + 2, int(ellipse.y + reach) + 2
     part = grey[top:bottom, left:right].astype(np.float64)
     if min(part.shape) < 4:
         raise Rejection(Reason.EDGES_LOST, "the ring is outside the frame")
-    from scipy import ndimage  # for those that ask for this method: 0.05 s
+    from scipy import ndimage  # here, since only this method needs it: 0.05 s
 
     return SplinePatch(ndimage.spline_filter(part, order=3, mode="mirror"), left, top)
 
@@ -75,10 +77,10 @@ def spline_patch_around(grey: GreyArray, ellipse: Ellipse) -> SplinePatch:
 def steepest_ellipse(
     patch: SplinePatch, start: Ellipse, angles_rad: FloatArray, *, dark_inside: bool
 ) -> Ellipse:
-    """Return `start` made larger or smaller by up to two pixels to where the edge is steepest.
+    """Return `start` scaled by up to two pixels of radius, to where the edge is steepest.
 
-    Four samples reach an edge less than a pixel away; overexposure can move it farther. The
-    median over the contour is what the edge is judged by.
+    The four samples of `edge_points` only reach edges about a pixel away, and overexposure can
+    displace an edge farther than that. The criterion is the median slope over the contour.
     """
     factors = 1.0 + _SEARCH_PX / start.mean_radius
     points = start.points(angles_rad) - start.centre
@@ -92,11 +94,11 @@ def steepest_ellipse(
 def edge_points(
     patch: SplinePatch, ellipse: Ellipse, angles_rad: FloatArray, *, dark_inside: bool
 ) -> FloatArray:
-    """Return the sub-pixel edge points (k, 2) [px] near points of an ellipse, k ≤ n.
+    """Return the sub-pixel edge points (k, 2) [px] near n points of an ellipse, k ≤ n.
 
-    At each point the frame is sampled at four places across the ellipse, one pixel apart; the
-    edge is at the inflection of the cubic through them. Points without an inflection of the right
-    sense within reach, or much fainter than the rest, are left out.
+    At each point the frame is sampled at four places across the ellipse, one pixel apart. The edge
+    is at the inflection of the cubic through the samples. Points are left out if there is no
+    inflection of the right sign within reach, or if the edge is much fainter there than elsewhere.
     """
     normals = np.stack((np.cos(angles_rad), np.sin(angles_rad)), axis=-1) @ np.linalg.inv(
         ellipse.stretch
@@ -106,7 +108,7 @@ def edge_points(
     samples = patch.sample(base[:, None] + _OFFSETS_PX[:, None] * normals[:, None])
     rising = samples if dark_inside else -samples
     _, linear, quadratic, cubic = (rising @ _CUBIC_FROM_SAMPLES.T).T
-    with np.errstate(divide="ignore", invalid="ignore"):  # no cubic term: no inflection, left out
+    with np.errstate(divide="ignore", invalid="ignore"):  # without a cubic term: NaN, left out
         shift = -quadratic / (3.0 * cubic)
         slope = linear + shift * quadratic
     plausible = (np.abs(shift) <= _MAX_SHIFT_PX) & (cubic < 0.0) & (slope > FAINTEST_SLOPE)
@@ -124,16 +126,16 @@ def fit_edge(
     edge_diameter_m: float,
     lag_deg: float,
 ) -> EdgeFit:
-    """Measure one edge of a ring from a preliminary ellipse.
+    """Measure one edge of a ring, starting from a preliminary ellipse.
 
-    ⌈4√(a² + b²)⌉ places on the ellipse, those near dots left out, give edge points, and they a
-    better ellipse; after the last pass the points are corrected for distortion and the ellipse is
-    fitted once more, in normalised coordinates.
+    Edge points are measured at ⌈4√(a² + b²)⌉ places on the ellipse, except near dots, and an
+    ellipse is fitted to them. This is repeated. After the last pass the points are corrected for
+    distortion and the ellipse is fitted in normalised coordinates.
 
     Raises
     ------
     Rejection
-        EDGES_LOST if too few points are left, POOR_ELLIPSE if they do not lie on an ellipse.
+        EDGES_LOST if too few points remain, POOR_ELLIPSE if they do not lie on an ellipse.
     """
     ellipse, dark_inside = start, edge_diameter_m > ring.inner_diameter_m
     for step in range(_PASSES + 1):
@@ -156,11 +158,11 @@ def fit_edge(
 
 
 def _robust_fit(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Fit an ellipse and drop points far from it; return the points kept and the conic."""
+    """Fit an ellipse and drop points far from it; return the remaining points and the conic."""
     conic = fit_ellipse(points)
     for _ in range(_PASSES):
         distance = np.abs(sampson_distance(conic, points))
-        limit = max(_MIN_OUTLIER_PX, _OUTLIER * 1.4826 * float(np.median(distance)))
+        limit = max(_MIN_OUTLIER_PX, _OUTLIER_SIGMAS * 1.4826 * float(np.median(distance)))
         if (distance <= limit).all():
             break
         points = points[distance <= limit]
