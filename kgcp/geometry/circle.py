@@ -174,7 +174,7 @@ def circle_planes(conic: FloatArray) -> tuple[CirclePlane, CirclePlane]:
     values, axes = np.linalg.eigh(oriented(conic))
     low, middle, high = values.tolist()
     if not low < 0.0 < middle:
-        raise Rejection(Reason.IMPOSSIBLE_GEOMETRY, "the outer conic is not an ellipse's cone")
+        raise Rejection(Reason.IMPOSSIBLE_GEOMETRY, "the outer conic is not the image of a circle")
     along = math.sqrt((middle - low) / (high - low)) * axes[:, 0]
     across = math.sqrt((high - middle) / (high - low)) * axes[:, 2]
     height = middle / math.sqrt(-high * low)

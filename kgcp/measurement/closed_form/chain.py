@@ -169,7 +169,8 @@ def _check_minimum(
     detour = sum(float(np.linalg.norm(centre - p.image_centre)) for p in (first, second)) - apart
     if not focal_px * detour < _MAX_DETOUR_PX:
         raise Rejection(
-            Reason.IMPOSSIBLE_GEOMETRY, f"D is least {focal_px * detour:.2f} px off its minima"
+            Reason.IMPOSSIBLE_GEOMETRY,
+            f"the minimum of D is {focal_px * detour:.2f} px off the known ones",
         )
 
 
