@@ -41,7 +41,7 @@ class Look:
 
 
 _FILM = Sensor(tone=ToneCurve.FILM, sharpening=0.6, sharpening_px=1.1)
-LOOKS = (
+BLUR_CLIP_PAIRS = (
     Look("linear", Sensor(), Response.LINEAR, None),
     Look("srgb", Sensor(tone=ToneCurve.SRGB), Response.SRGB, 95),
     Look("consumer", _FILM, Response.UNKNOWN, 92),
@@ -125,7 +125,7 @@ def tilt_deg(pose: Pose) -> float:
 
 def some_camera(rng: np.random.Generator) -> tuple[Camera, Look]:
     """Return one of the cameras, of one of the kinds."""
-    look = LOOKS[rng.integers(len(LOOKS))]
+    look = BLUR_CLIP_PAIRS[rng.integers(len(BLUR_CLIP_PAIRS))]
     return replace(CAMERAS[rng.integers(len(CAMERAS))], response=look.response), look
 
 

@@ -13,7 +13,7 @@ from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.grey_range import full_scale
 from kgcp.measurement.records import Considered
 from kgcp.measurement.search.dot_reading import describe_dots, read_dots
-from kgcp.measurement.search.template_match import CODE_LIKE, match_templates, polar_patch
+from kgcp.measurement.search.template_match import MIN_SCORE_OF_A_CODE, match_templates, polar_patch
 from kgcp.measurement.search.templates import SAMPLED_RADII
 from kgcp.targets.layout import Ring, Target
 
@@ -49,7 +49,7 @@ def ring_to_explain(target: Target, considered: Sequence[Considered]) -> Conside
         candidate
         for candidate in considered
         if candidate.ring == target.ring.name
-        and candidate.score >= CODE_LIKE
+        and candidate.score >= MIN_SCORE_OF_A_CODE
         and any(
             _encloses(candidate.outline, best.outline, target, ring) for ring in target.replicas
         )
@@ -92,12 +92,12 @@ def explain(
     at = f"ring at ({outline.x:.0f}, {outline.y:.0f}), radius {outline.mean_radius:.1f} px"
     reason = candidate.reason
     finding = None
-    if candidate.is_match or candidate.score >= CODE_LIKE:
+    if candidate.is_match or candidate.score >= MIN_SCORE_OF_A_CODE:
         finding = _plain_cause(grey, ring, outline, min_radius_px)
     cause = None
     if finding is not None:
         reason, cause = finding
-    elif reason in _WRONG_CODE and candidate.score >= CODE_LIKE:
+    elif reason in _WRONG_CODE and candidate.score >= MIN_SCORE_OF_A_CODE:
         cause = describe_dots(read_dots(grey, outline, ring), ring, target, targets)
     detail = at if cause is None else f"{at}, {cause}"
     if candidate.detail:

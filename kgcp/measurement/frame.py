@@ -18,9 +18,9 @@ from kgcp.measurement.closed_form.circles import paper_outlines
 from kgcp.measurement.diagnosis import explain, ring_to_explain
 from kgcp.measurement.plate_prior import PlatePrior
 from kgcp.measurement.records import Considered, Measurement, Miss, Outcome
-from kgcp.measurement.search.candidates import Candidate, find_code, find_dotted, find_rings
+from kgcp.measurement.search.candidates import Candidate, find_code, find_dotted_rings, find_rings
 from kgcp.measurement.search.code_signal import CodeMatch, fixed_lag_score, points_of_code
-from kgcp.measurement.search.false_alarm import check_chance
+from kgcp.measurement.search.false_alarm import check_false_alarm
 from kgcp.measurement.search.initial_pose import initial_pose
 from kgcp.measurement.search.template_match import match_templates_at
 from kgcp.settings import DetectSettings, Method
@@ -78,7 +78,7 @@ def examine(
         return Examination((), ())
     search = paper_outlines if settings.method is Method.PAPER else find_rings
     rings = (ring for target in targets for ring in target.rings)
-    candidates = find_dotted(grey, search(grey, settings), rings)
+    candidates = find_dotted_rings(grey, search(grey, settings), rings)
     trials = [
         _try_target(
             grey, camera, candidates, target, settings, priors.get(target.name, PlatePrior())
@@ -183,7 +183,7 @@ def measure_match(
     start = initial_pose(grey, camera, target, match)
     visible = _check_plate(grey, camera, target, match.ring, start.pose, settings)
     measurement = measure_by_model(grey, camera, target, start, prior, visible)
-    check_chance(measurement, target, match.ring, settings.false_alarm)
+    check_false_alarm(measurement, target, match.ring, settings.false_alarm)
     return measurement
 
 

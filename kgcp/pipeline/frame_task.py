@@ -33,7 +33,7 @@ from kgcp.measurement.records import (
     ToneBase,
     is_unreadable,
 )
-from kgcp.measurement.search.template_match import CODE_LIKE
+from kgcp.measurement.search.template_match import MIN_SCORE_OF_A_CODE
 from kgcp.measurement.systematic_errors import common_uncertainty
 from kgcp.pipeline.execution.kept_frames import KeptFrames
 from kgcp.pipeline.execution.threads import single_threaded
@@ -305,7 +305,9 @@ def _coded_outcomes(
     replacements: dict[str, Outcome] = {}
     for target in missing:
         code_like = [
-            ring for ring in considered if ring.target == target.name and ring.score >= CODE_LIKE
+            ring
+            for ring in considered
+            if ring.target == target.name and ring.score >= MIN_SCORE_OF_A_CODE
         ]
         replacements[target.name] = (
             miss_of(grey, target, code_like, job.settings, job.targets)

@@ -83,7 +83,7 @@ def test_a_chance_that_nothing_meets_leaves_nothing(flight: Path, tmp_path: Path
     detect(flight, tmp_path, "--false-alarm", "1e-60")
     rows = pd.read_parquet(tmp_path / "detections.parquet")
     assert (rows["status"] != "measured").all()
-    assert rows["detail"].str.contains("comes about by chance").sum() == FRAMES - 1
+    assert rows["detail"].str.contains("occurs by chance").sum() == FRAMES - 1
 
 
 def test_an_impossible_chance_is_refused_in_one_line(flight: Path, tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def test_another_code_is_named_with_its_numbers(
     frame = draw_frame((plate_b(), place_plate((240.0, 180.0), 30.0, turn_deg=30.0)))
     found = miss(frame, camera, bare)
     assert found.reason is Reason.OTHER_CODE
-    assert "a dot off by" in found.detail
+    assert "a dot is off by" in found.detail
 
 
 def test_the_ring_of_a_measured_target_explains_no_other_s_miss(
@@ -117,4 +117,4 @@ def test_a_code_that_chance_explains_is_refused(
     (missed,) = measure_frame(frame, camera, (bare,), DetectSettings(false_alarm=1e-30))
     assert isinstance(missed, Miss)
     assert missed.reason is Reason.CODE_MISMATCH
-    assert "comes about by chance" in missed.detail
+    assert "occurs by chance" in missed.detail

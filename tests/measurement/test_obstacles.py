@@ -18,7 +18,7 @@ from kgcp.measurement.adjustment.fit_target import measure_by_model
 from kgcp.measurement.frame import measure_match
 from kgcp.measurement.plate_prior import PlatePrior
 from kgcp.measurement.records import InitialPose, Measurement
-from kgcp.measurement.search.candidates import find_code, find_dotted, find_rings
+from kgcp.measurement.search.candidates import find_code, find_dotted_rings, find_rings
 from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import TARGET_PLATE
@@ -206,7 +206,7 @@ def test_a_replica_leads_to_its_ring_of_which_a_quarter_is_hidden(photograph: Ph
     )
     grey = photograph(LENS, pose, rng, plate=plate)
     settings, replica = DetectSettings(), target.rings[1]
-    candidates = find_dotted(grey, find_rings(grey, settings), [replica])
+    candidates = find_dotted_rings(grey, find_rings(grey, settings), [replica])
     matches, _ = find_code(candidates[replica], replica, settings)
     seen = measure_match(grey, LENS, target, matches[0], settings, PlatePrior())
     assert seen.uncertainty is not None

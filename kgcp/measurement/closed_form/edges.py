@@ -12,7 +12,7 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse, ellipse_from_conic, fit_ellipse, sampson_distance
 from kgcp.measurement.search.code_signal import clear_of_dots
-from kgcp.measurement.search.sampling import FAINTEST_SLOPE
+from kgcp.measurement.search.sampling import MIN_EDGE_SLOPE
 from kgcp.targets.layout import Ring
 
 _OFFSETS_PX = np.array([-1.5, -0.5, 0.5, 1.5])  # of the four samples across an edge
@@ -111,7 +111,7 @@ def edge_points(
     with np.errstate(divide="ignore", invalid="ignore"):  # without a cubic term: NaN, left out
         shift = -quadratic / (3.0 * cubic)
         slope = linear + shift * quadratic
-    plausible = (np.abs(shift) <= _MAX_SHIFT_PX) & (cubic < 0.0) & (slope > FAINTEST_SLOPE)
+    plausible = (np.abs(shift) <= _MAX_SHIFT_PX) & (cubic < 0.0) & (slope > MIN_EDGE_SLOPE)
     if plausible.any():
         plausible &= slope >= _MIN_SLOPE * np.median(slope[plausible])
     return np.asarray((base + shift[:, None] * normals)[plausible])

@@ -1,1 +1,1 @@
-"""Search for rings in a frame, and for their codes."""
+"""Search for rings in a frame, and identification of their codes."""

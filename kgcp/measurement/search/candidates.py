@@ -1,4 +1,4 @@
-"""Selection of the rings in a frame that carry a target's code."""
+"""Selection of the rings in a frame that carry the code of a target."""
 
 from __future__ import annotations
 
@@ -23,43 +23,47 @@ from kgcp.targets.layout import Ring
 
 # Tuning of the candidates. Its benchmarks are `benchmarks.search.hard_frames`, for what is found
 # (values in docs/method.md, "Constants of the search"), and `benchmarks.search.false_alarms`.
-_MIN_CONTRAST = 0.02  # of what is white in the frame
-_MIN_DOT_CONTRAST = 0.1  # of the ring's contrast: what blur leaves of dots
-_UNEVEN = 0.85  # spread of ink, disc and plate, of the contrast in light: shade leaves a sixth
-# Spread of what disc and plate differ by, over half of the angles, of the ring's depth: up to 0.6
-# for 900 targets, half in shade or not, and from 0.4 on for 99 % of rings in textures
-_MOST_APART = 0.7
-_ROUNDING = 1.0  # of that spread, in grey values
-_DISC_SHARE, _PLATE = 0.8, 1.1  # where the plate is seen, of the inner and of the outer radius
-_CIRCLE_LOSS = 0.06  # of the score, where an ellipse stands for the true perspective
-_SEED_REACH = 2.0  # around expected places, of their radii
-_SMALLEST_WINDOW_PX = 12
-_DIGITS = 6  # of proportions that are the same
+_MIN_CONTRAST = 0.02  # relative to the frame's white
+_MIN_DOT_CONTRAST = 0.1  # relative to the ring's contrast; blur may leave so little of the dots
+# Largest spread of the grey values of ink, of disc and of plate, relative to the contrast in full
+# light. It allows for shade that leaves a sixth of the light.
+_MAX_SPREAD = 0.85
+# Disc and plate at the same angle get the same light, so their difference must vary little: over
+# some half of the angles, by at most this share of the ring's depth. 900 targets, some of them half
+# in shade, had up to 0.6; 99 % of the rings in textures have more than 0.4.
+_MAX_DIFFERENCE_SPREAD = 0.7
+_ROUNDING = 1.0  # grey values of that spread that rounding may cause
+# Radii at which the disc and the plate are sampled, relative to the inner and to the outer radius.
+_DISC_RADIUS, _PLATE_RADIUS = 0.8, 1.1
+_ELLIPSE_SCORE_LOSS = 0.06  # of the score, since the outline ellipse replaces the true perspective
+_WINDOW_REACH = 2.0  # of the searched window around expected places, in their radii
+_MIN_WINDOW_PX = 12
+_RATIO_DIGITS = 6  # to which proportions of rings are compared
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """A dark ring with brighter places, between a bright disc and a bright plate."""
+    """A dark ring with brighter spots, between a bright disc and a bright plate."""
 
     outline: Ellipse  # of its outer circle [px]
-    # (radii, angles): grey values around it, for
-    # `kgcp.measurement.search.template_match.match_templates`
+    # (radii, angles): polar samples of grey values, for `template_match.match_templates`
     patch: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
-class Refusal:
-    """A ring in the frame that is not the one looked for."""
+class RefusedCandidate:
+    """A ring in the frame that does not carry the code."""
 
     outline: Ellipse  # of its outer circle [px]
     score: float  # normalised cross-correlation of the whole ring, -1…1
-    # what speaks against it; not the exception, whose traceback would keep the frame
+    # Why it was rejected. The exception is not kept, because its traceback would keep the frame in
+    # memory.
     reason: Reason
     detail: str
 
 
 def find_rings(grey: GreyArray, settings: DetectSettings) -> tuple[Ellipse, ...]:
-    """Return the outlines of all dark rings in a frame that may be a target's."""
+    """Return the outlines of all dark rings in a frame that may belong to a target."""
     pyramid = build_pyramid(grey)
     return track_outlines(pyramid, find_seeds(pyramid, settings.min_radius_px))
 
@@ -67,15 +71,15 @@ def find_rings(grey: GreyArray, settings: DetectSettings) -> tuple[Ellipse, ...]
 def find_rings_at(
     grey: GreyArray, centres_px: FloatArray, radii_px: FloatArray
 ) -> tuple[Ellipse, ...]:
-    """Return the outlines of rings at places (n, 2) of about some radii (n,), however faint.
+    """Return the outlines of rings near expected centres (n, 2), given approximate radii (n,).
 
-    Nothing but the part of the frame around them is looked at.
+    Faint rings are returned, too. Only the part of the frame around the centres is searched.
     """
-    reach = _SEED_REACH * radii_px[:, None] + 1.0
+    reach = _WINDOW_REACH * radii_px[:, None] + 1.0
     low = np.maximum(np.floor((centres_px - reach).min(axis=0)).astype(int), 0)
     x1, y1 = np.ceil((centres_px + reach).max(axis=0)).astype(int) + 1
     window = grey[low[1] : max(y1, 0), low[0] : max(x1, 0)]
-    if min(window.shape) < _SMALLEST_WINDOW_PX:
+    if min(window.shape) < _MIN_WINDOW_PX:
         return ()
     seeds = Seeds(centres_px - low, radii_px, np.ones(len(radii_px)))
     return tuple(
@@ -84,107 +88,107 @@ def find_rings_at(
     )
 
 
-def find_dotted(
+def find_dotted_rings(
     grey: GreyArray, outlines: tuple[Ellipse, ...], rings: Iterable[Ring]
 ) -> dict[Ring, tuple[Candidate, ...]]:
-    """Return for each ring the outlines that look like it but for their code.
+    """Return for each ring the outlines that look like a ring of its shape with dots.
 
-    They have a dark ring between bright disc and plate, brighter in places. Rings of the same
-    proportions, such as replicas, share their candidates.
+    Their ink is dark between a bright disc and a bright plate, with brighter spots; the code is not
+    compared. Rings with the same proportions, such as replicas, share their candidates.
     """
-    least_contrast = _MIN_CONTRAST * brightest_level(grey)
+    min_contrast = _MIN_CONTRAST * brightest_level(grey)
     by_shape: dict[tuple[float, float], tuple[Candidate, ...]] = {}
     by_ring: dict[Ring, tuple[Candidate, ...]] = {}
     for ring in rings:
         ratios = ring.inner_ratio, ring.code_diameter_m / ring.outer_diameter_m
-        shape = round(ratios[0], _DIGITS), round(ratios[1], _DIGITS)
+        shape = round(ratios[0], _RATIO_DIGITS), round(ratios[1], _RATIO_DIGITS)
         if shape not in by_shape:
-            by_shape[shape] = _dotted(grey, outlines, *ratios, least_contrast)
+            by_shape[shape] = _candidates_of_shape(grey, outlines, *ratios, min_contrast)
         by_ring[ring] = by_shape[shape]
     return by_ring
 
 
 def find_code(
     candidates: Iterable[Candidate], ring: Ring, settings: DetectSettings
-) -> tuple[tuple[CodeMatch, ...], tuple[Refusal, ...]]:
+) -> tuple[tuple[CodeMatch, ...], tuple[RefusedCandidate, ...]]:
     """Look for a ring's code in all candidates.
 
     Returns
     -------
     matches : tuple of CodeMatch
         Best first.
-    refused : tuple of Refusal
-        The others.
+    refused : tuple of RefusedCandidate
+        The candidates that do not match.
     """
     matches: list[CodeMatch] = []
-    refused: list[Refusal] = []
+    refused: list[RefusedCandidate] = []
     for candidate in candidates:
         outline = candidate.outline
         template_match = match_templates(candidate.patch, ring, outline.a)
         try:
-            template_match.check(settings.min_score - _CIRCLE_LOSS)
+            template_match.check(settings.min_score - _ELLIPSE_SCORE_LOSS)
         except Rejection as rejection:
             reason, detail = rejection.reason, rejection.detail
-            refused.append(Refusal(outline, template_match.score, reason, detail))
+            refused.append(RefusedCandidate(outline, template_match.score, reason, detail))
             continue
         matches.append(template_match.code_match(ring, outline))
     return tuple(sorted(matches, key=lambda match: -match.score)), tuple(refused)
 
 
-def _dotted(
+def _candidates_of_shape(
     grey: GreyArray,
     outlines: tuple[Ellipse, ...],
-    inner: float,
-    code: float,
-    least_contrast: float,
+    inner_ratio: float,
+    code_ratio: float,
+    min_contrast: float,
 ) -> tuple[Candidate, ...]:
-    """Return the candidates for rings with such circles, of their outer radius."""
-    radii = np.array((_DISC_SHARE * inner, code, _PLATE))
+    """Return the candidates for rings whose inner and code circles have these relative radii."""
+    radii = np.array((_DISC_RADIUS * inner_ratio, code_ratio, _PLATE_RADIUS))
     values = sample_ellipses(grey, outlines, radii, CIRCLE)
-    dotted = np.empty(len(outlines), dtype=bool)
-    _mark_dotted(np.sort(values, axis=2), least_contrast, dotted)
-    dotted[dotted] = _are_alike_inside_and_outside(values[dotted])
-    kept = tuple(outlines[i] for i in np.flatnonzero(dotted))
+    is_dotted = np.empty(len(outlines), dtype=bool)
+    _mark_dotted(np.sort(values, axis=2), min_contrast, is_dotted)
+    is_dotted[is_dotted] = _are_lit_alike(values[is_dotted])
+    kept = tuple(outlines[i] for i in np.flatnonzero(is_dotted))
     return tuple(map(Candidate, kept, sample_ellipses(grey, kept, SAMPLED_RADII, CIRCLE)))
 
 
 @compiled
-def _mark_dotted(values: FloatArray, least: float, dotted: BoolArray) -> None:
-    """Mark outlines whose grey values, sorted, are consistent with a ring that has dots.
+def _mark_dotted(values: FloatArray, min_contrast: float, is_dotted: BoolArray) -> None:
+    """Mark outlines whose grey values are consistent with a ring that has dots.
 
-    `values` (n, 3, angles) are those on disc, code circle and plate. As in the ring check, order
-    statistics stand for ink and white, since dots, dirt and hidden parts move means: a quarter up
-    from the darkest of the code circle is ink, the brightest 4 % are dots.
+    `values` (n, 3, angles) are the sorted grey values on disc, code circle and plate. As in the
+    ring check, quantiles measure ink and white, because dots, dirt and hidden parts shift means. On
+    the code circle, the lower quartile is ink and the brightest 4 % are dots.
     """
     for i in range(len(values)):
         disc, code, plate = values[i, 0], values[i, 1], values[i, 2]
         black = code[_rank(0.25)]
         contrast = min(disc[_rank(0.5)], plate[_rank(0.5)]) - black
-        brightest_disc, brightest_plate = disc[_rank(0.7)] - black, plate[_rank(0.8)] - black
-        dotted[i] = (
-            contrast > least
+        disc_contrast, plate_contrast = disc[_rank(0.7)] - black, plate[_rank(0.8)] - black
+        is_dotted[i] = (
+            contrast > min_contrast
             and code[_rank(0.96)] - black > _MIN_DOT_CONTRAST * contrast
             and code[_rank(0.35)] - code[_rank(0.05)]
-            < _UNEVEN * min(brightest_disc, brightest_plate)
-            and disc[_rank(0.7)] - disc[_rank(0.3)] < _UNEVEN * brightest_disc
-            and plate[_rank(0.8)] - plate[_rank(0.4)] < _UNEVEN * brightest_plate
+            < _MAX_SPREAD * min(disc_contrast, plate_contrast)
+            and disc[_rank(0.7)] - disc[_rank(0.3)] < _MAX_SPREAD * disc_contrast
+            and plate[_rank(0.8)] - plate[_rank(0.4)] < _MAX_SPREAD * plate_contrast
         )
 
 
-def _are_alike_inside_and_outside(values: FloatArray) -> BoolArray:
-    """Return of which outlines disc and plate are lit alike at most angles, as they are in shade.
+def _are_lit_alike(values: FloatArray) -> BoolArray:
+    """Return for each outline whether disc and plate are lit alike at half of the angles.
 
-    What falls on the plate at an angle falls on the disc, too, while two circles in a texture know
-    nothing of each other. `values` (n, 3, angles) are grey values on disc, code circle and plate.
+    Light and shade fall on disc and plate alike at any angle, whereas two circles in a texture are
+    unrelated. `values` (n, 3, angles) are grey values on disc, code circle and plate.
     """
     disc, code, plate = values[:, 0], values[:, 1], values[:, 2]
     differences, half = np.sort(disc - plate, axis=1), ANGLES // 2
     spreads = (differences[:, half:] - differences[:, :-half]).min(axis=1)
     rank = _rank(0.67)
     depths = np.partition(np.minimum(disc, plate) - code, rank, axis=1)[:, rank]
-    return np.asarray(spreads - _ROUNDING < _MOST_APART * depths)
+    return np.asarray(spreads - _ROUNDING < _MAX_DIFFERENCE_SPREAD * depths)
 
 
 @inlined
-def _rank(share: float) -> int:
-    return round(share * (ANGLES - 1))
+def _rank(quantile: float) -> int:
+    return round(quantile * (ANGLES - 1))

@@ -1,4 +1,4 @@
-"""The code on the black ring: identity and heading of a plate, §2.3 of Cucci (2016)."""
+"""The code on the black ring: identity and heading of the plate (§2.3 of Cucci 2016)."""
 
 from __future__ import annotations
 
@@ -14,36 +14,40 @@ from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.search.correlation import Bank, bank_of, correlate
+from kgcp.measurement.search.correlation import TemplateBank, build_bank, correlate
 from kgcp.measurement.search.sampling import sample_grey
 from kgcp.targets.layout import Ring
 
 _SAMPLES = 360
 CODE_ANGLES_RAD = np.linspace(0.0, 2.0 * math.pi, _SAMPLES, endpoint=False)
 CODE_CIRCLE = np.stack((np.cos(CODE_ANGLES_RAD), np.sin(CODE_ANGLES_RAD)), axis=-1)
-_BLURS_RAD = np.array([0.03, 0.1, 0.18, 0.28])  # edge spreads that the code is tried with
-_DOT_REACH_PX = 3.0  # samples reach 1.5 px inwards, blur as far again
-_MIN_CLEAR = 0.55  # of an edge
-_FREQUENCIES = 120  # of a code with a known heading: the least blur leaves 2e-3 of higher ones
-_LAGS_AT_HEADING = np.arange(-6, 7)  # degrees that a replica's heading may be off
+_BLURS_RAD = np.array([0.03, 0.1, 0.18, 0.28])  # σ of the edges of the reference codes
+# Distance from a dot up to which its blur disturbs an edge: samples reach 1.5 px inwards, and blur
+# as far again.
+_DOT_REACH_PX = 3.0
+_MIN_CLEAR = 0.55  # share of an edge that counts as clear of dots in any case
+# Frequencies that are compared where the heading is known. The smallest blur reduces higher ones to
+# 2e-3.
+_FREQUENCIES = 120
+_LAGS_AT_HEADING = np.arange(-6, 7)  # by how many degrees a replica's heading may be off
 
 
 @dataclass(frozen=True, slots=True)
 class CodeMatch:
-    """A ring in the frame that carries the code of a target's."""
+    """A ring in the frame that carries the code of a target's ring."""
 
-    ring: Ring  # whose code it is
-    outer: Ellipse  # preliminary outer ellipse [px]
+    ring: Ring  # the target's ring
+    outer: Ellipse  # preliminary outer ellipse in the frame [px]
     score: float  # normalised cross-correlation of the code, -1…1
-    lag_deg: float  # heading of the plate's +x axis as an angle of `Ellipse.points` [deg]
-    # grey levels of ring and plate, in grey values
+    lag_deg: float  # direction of the plate's +x axis, as an angle of `Ellipse.points` [deg]
+    # levels of ink and plate, in grey values
     black: float
     white: float
 
 
 @lru_cache(maxsize=64)
 def reference_signals(ring: Ring) -> FloatArray:
-    """Return a ring's code (4, 360) at heading 0: 1 in dots, 0 between, four degrees of blur."""
+    """Return a ring's code (4, 360) at heading 0, with four blurs: 1 in dots, 0 between them."""
     degrees = np.degrees(CODE_ANGLES_RAD)
     offset = np.abs((degrees[:, None] - np.array(ring.code_deg) + 180.0) % 360.0 - 180.0)
     sharp = np.clip(ring.dot_half_angle_deg + 0.5 - offset.min(axis=1), 0.0, 1.0)
@@ -53,22 +57,23 @@ def reference_signals(ring: Ring) -> FloatArray:
 
 
 def match_code(signals: FloatArray, ring: Ring) -> tuple[FloatArray, FloatArray]:
-    """Return the best normalised cross-correlation over all lags, and the lag (§2.3).
+    """Return the best normalised cross-correlation over all lags, and its lag (§2.3).
 
-    The score is reported, and the lag turns the pose that the adjustment starts from. Hence all
-    frequencies and double precision, unlike `kgcp.measurement.search.correlation.correlate`.
+    The score is reported, and the lag determines the heading that the adjustment starts from.
+    Therefore all frequencies and double precision are used here, unlike in
+    `kgcp.measurement.search.correlation.correlate`.
 
     Parameters
     ----------
     signals : (m, 360) array
         Grey values along code circles, one per degree.
     ring : Ring
-        Whose code is looked for.
+        The ring whose code is compared.
 
     Returns
     -------
     scores, lags_deg : (m,) arrays
-        The lag is refined between samples by a parabola.
+        Lags are interpolated between samples by a parabola.
     """
     by_blur = np.fft.irfft(np.fft.rfft(signals)[:, None] * _reference_spectra(ring), _SAMPLES)
     scores, lags_deg = np.empty(len(signals)), np.empty(len(signals))
@@ -78,7 +83,7 @@ def match_code(signals: FloatArray, ring: Ring) -> tuple[FloatArray, FloatArray]
 
 @lru_cache(maxsize=64)
 def _reference_spectra(ring: Ring) -> npt.NDArray[np.complex128]:
-    """Return the conjugate spectra of the reference signals, less their means, of norm 1."""
+    """Return the conjugate spectra of the reference signals with mean 0 and norm 1."""
     signals = reference_signals(ring)
     centred = signals - signals.mean(axis=1, keepdims=True)
     norm = np.linalg.norm(centred, axis=1, keepdims=True)
@@ -89,7 +94,7 @@ def _reference_spectra(ring: Ring) -> npt.NDArray[np.complex128]:
 def _find_peaks(
     signals: FloatArray, by_blur: FloatArray, scores: FloatArray, lags_deg: FloatArray
 ) -> None:
-    """Fill in the largest value by blur and lag of each signal, and its lag between samples."""
+    """Fill in each signal's highest score over blurs and lags, and the interpolated lag [deg]."""
     for i in range(len(signals)):
         correlation, peak = by_blur[i, 0], 0
         for candidate in by_blur[i]:
@@ -105,26 +110,26 @@ def _find_peaks(
 
 
 def fixed_lag_score(grey: GreyArray, points: FloatArray, visible: BoolArray, ring: Ring) -> float:
-    """Return the correlation of a code where its heading is known, to a few degrees.
+    """Return the score of a code whose heading is known to a few degrees.
 
     Parameters
     ----------
     points : (360, 2) array
-        The code circle in the frame, from the plate's +x axis on [px].
+        The code circle in the frame, starting at the plate's +x axis [px].
     visible : (360,) array
-        Which of them count.
+        Which of the points are compared.
     """
     scores = correlate(sample_grey(grey, points[None]), _code_circle(ring), visible)
     return float(scores.take(_LAGS_AT_HEADING, axis=2, mode="wrap").max())
 
 
 @lru_cache(maxsize=64)
-def _code_circle(ring: Ring) -> Bank:
-    return bank_of(reference_signals(ring)[:, None], np.ones(1), _FREQUENCIES)
+def _code_circle(ring: Ring) -> TemplateBank:
+    return build_bank(reference_signals(ring)[:, None], np.ones(1), _FREQUENCIES)
 
 
 def points_of_code(camera: Camera, pose: Pose, ring: Ring) -> FloatArray:
-    """Return raw pixels (360, 2) of a ring's code circle where a pose puts it, one per degree."""
+    """Return the code circle that a pose predicts, one point per degree: raw pixels (360, 2)."""
     radius_m = np.array([0.5 * ring.code_diameter_m])
     circles = camera.project_circles(pose.rotation, pose.translation_m, radius_m, CODE_CIRCLE)
     return circles.reshape(-1, 2)
@@ -133,9 +138,10 @@ def points_of_code(camera: Camera, pose: Pose, ring: Ring) -> FloatArray:
 def clear_of_dots(
     angles_rad: FloatArray, ring: Ring, edge_diameter_m: float, lag_deg: float, px_per_m: float
 ) -> BoolArray:
-    """Return for each angle (n,) on an edge whether the blur of all dots stays away from it.
+    """Return for each angle (n,) on an edge whether it is out of reach of all blurred dots.
 
-    On a small ring with many dots no angle may be clear: then those farthest from dots are taken.
+    On a small ring with many dots no angle may be clear. Then the angles farthest from dots count
+    as clear.
     """
     dots_rad = np.radians(np.add(ring.code_deg, lag_deg))
     gap_m = np.empty(len(angles_rad))
@@ -154,7 +160,10 @@ def _measure_gaps(
     other_radius: float,
     gaps: FloatArray,
 ) -> None:
-    """Fill in how far points of one circle are from the nearest of some points of another."""
+    """Fill in the distance of each point on one circle from the nearest of the points on another.
+
+    The circles are concentric; their points are given by angles.
+    """
     for i in range(len(angles_rad)):
         nearest = -1.0
         for other_rad in others_rad:

@@ -1,14 +1,13 @@
-"""Masked normalised cross-correlation: how alike polar patches and templates are, at every turn.
+"""Masked normalised cross-correlation of polar patches with polar templates, at all rotations.
 
-The same measure serves whole rings, rings of which something hides a part, and single code
-circles; docs/method.md, "The code", derives it. With the weights w of the rows, and ⟨…⟩ the
-weighted mean over the visible samples, a template i scores against a patch p
+The same score is used for whole rings, for partly hidden rings, and for code circles alone;
+docs/method.md, "The code", derives it. With ⟨…⟩ the mean over the visible samples, weighted by row,
+the score of a template i against a patch p is
 
     (⟨i p⟩ − ⟨i⟩⟨p⟩) / √((⟨i²⟩ − ⟨i⟩²) (⟨p²⟩ − ⟨p⟩²))
 
-Where nothing is hidden ⟨i⟩ is 0 and ⟨i²⟩ is 1 for a standardised template, and the score is ⟨i p⟩
-over the patch's standard deviation: the unmasked correlation is the special case that skips the
-sums over hidden angles.
+Templates are standardised: over all samples ⟨i⟩ is 0 and ⟨i²⟩ is 1. If nothing is hidden, the score
+is therefore ⟨i p⟩ over the patch's standard deviation, and the sums over hidden angles are skipped.
 """
 
 from __future__ import annotations
@@ -24,86 +23,90 @@ from kgcp.geometry.arrays import BoolArray, FloatArray, SingleArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Bank:
-    """Polar templates, prepared for `correlate`: t of them."""
+class TemplateBank:
+    """A set of t polar templates, prepared for `correlate`."""
 
     images: FloatArray  # (t, rows, angles)
-    weights: FloatArray  # (rows,): of each row's samples; they sum to 1 over all samples
-    # (t, rows, 2 frequencies): of the standardised images along the angle, weighted: real parts,
-    # then imaginary ones
+    weights: FloatArray  # (rows,): weight of a sample in each row; the sum over all samples is 1
+    # (t, rows, 2 frequencies): weighted Fourier coefficients of the standardised images along the
+    # angle, real parts before imaginary ones
     spectra: SingleArray
-    # (2 t, 2 angles): weighted sums over the rows, of the standardised images and then of their
-    # squares, as functions of the turn: backwards and twice around, so that the turns by 0, 1, … of
-    # what is at the angle a are the slice that begins at angles − a
+    # (2 t, 2 angles): weighted sums over the rows of the standardised images, then of their
+    # squares. They are stored backwards and repeated, so that the values at angle a for the lags 0,
+    # 1, … are the slice that begins at angles − a.
     moments: SingleArray
-    # (angles, 2 frequencies): takes samples along the angle to their Fourier coefficients
-    to_spectrum: SingleArray
-    to_turns: SingleArray  # (2 frequencies, angles): takes Fourier coefficients back to samples
+    to_spectrum: SingleArray  # (angles, 2 frequencies): maps samples to Fourier coefficients
+    to_lags: SingleArray  # (2 frequencies, angles): maps Fourier coefficients to samples
 
 
-def bank_of(images: FloatArray, row_weights: FloatArray, frequencies: int) -> Bank:
-    """Prepare templates (t, rows, angles), given the weights of their rows (rows,).
+def build_bank(images: FloatArray, row_weights: FloatArray, frequencies: int) -> TemplateBank:
+    """Prepare polar templates for `correlate`.
 
     Parameters
     ----------
     images : (t, rows, angles) array
-        The number of angles is even.
+        The templates. The number of angles must be even.
     row_weights : (rows,) array
+        Weights of the rows, in any unit.
     frequencies : int
-        How many of the lowest, the constant included, are compared; less than angles / 2. What is
-        blurred has no others, and the costs are proportional to them.
+        Number of the lowest frequencies that are compared, including the constant; less than angles
+        / 2. Blurred images contain no higher ones, and the cost is proportional to this number.
     """
     angles = images.shape[2]
     weights = row_weights / (angles * np.sum(row_weights))
     centred = images - np.einsum("tra,r->t", images, weights)[:, None, None]
     centred /= np.sqrt(np.einsum("tra,tra,r->t", centred, centred, weights))[:, None, None]
-    to_spectrum, to_turns = _fourier(angles, frequencies)
+    to_spectrum, to_lags = _fourier(angles, frequencies)
     moments = np.concatenate([np.einsum("tra,r->ta", centred**k, weights) for k in (1, 2)])
     backwards = np.tile(np.roll(moments[:, ::-1], 1, axis=1), 2)
-    return Bank(
+    return TemplateBank(
         images=images,
         weights=weights,
         spectra=((centred * weights[:, None]) @ to_spectrum).astype(np.float32),
         moments=backwards.astype(np.float32),
         to_spectrum=to_spectrum.astype(np.float32),
-        to_turns=to_turns.astype(np.float32),
+        to_lags=to_lags.astype(np.float32),
     )
 
 
 @lru_cache(maxsize=8)
 def _fourier(angles: int, frequencies: int) -> tuple[FloatArray, FloatArray]:
-    """Return the matrices to Fourier coefficients, real parts before imaginary ones, and back.
+    """Return the matrices from samples to Fourier coefficients and back.
 
-    For so few frequencies products with matrices are faster than fast transforms.
+    Coefficients are real parts, then imaginary parts. For so few frequencies, matrix products are
+    faster than fast Fourier transforms.
     """
     angles_rad = np.linspace(0.0, 2.0 * np.pi, angles, endpoint=False)
     phases = np.arange(frequencies)[:, None] * angles_rad
     waves = np.vstack((np.cos(phases), -np.sin(phases)))
-    multiplicity = np.where(np.arange(frequencies) == 0, 1.0, 2.0)  # each has a conjugate
+    multiplicity = np.where(np.arange(frequencies) == 0, 1.0, 2.0)  # 2: counts the conjugate, too
     return waves.T.copy(), waves * np.tile(multiplicity, 2)[:, None] / angles
 
 
-def correlate(patch: FloatArray, bank: Bank, visible: BoolArray | None = None) -> SingleArray:
-    """Score a polar patch against all templates, at all radial shifts and turns.
+def correlate(
+    patch: FloatArray, bank: TemplateBank, visible: BoolArray | None = None
+) -> SingleArray:
+    """Score a polar patch against all templates, at all radial shifts and rotations.
 
     Parameters
     ----------
     patch : (rows + shifts − 1, angles) array
         Grey values. Shift s compares the template with the rows from s on.
     visible : (angles,) array of bool, optional
-        Which angles of the patch are compared; by default all.
+        Which angles of the patch are compared; all by default.
 
     Returns
     -------
     (t, shifts, angles) array of float32
-        Scores, −1…1, by template, shift and lag: the turn of the template, in samples.
+        Scores, −1…1, by template, shift and lag. The lag is the rotation of the template in
+        samples.
     """
     templates, _, angles = bank.images.shape
     share = 1.0 if visible is None else np.count_nonzero(visible) / angles
     masked = patch if visible is None else patch * visible
     spectrum = masked.astype(np.float32) @ bank.to_spectrum
     products, levels = _multiply(masked, spectrum, share, bank.weights, bank.spectra)
-    scores = products @ bank.to_turns
+    scores = products @ bank.to_lags
     if visible is not None:
         _normalise(scores, bank.moments, visible, levels)
     return np.asarray(scores.reshape(templates, -1, angles))
@@ -119,8 +122,9 @@ def _multiply(
 ) -> tuple[SingleArray, FloatArray]:
     """Return the Fourier coefficients of ⟨i p⟩ / σ (templates · shifts, parts), and ⟨p⟩ / σ.
 
-    σ² = ⟨p²⟩ − ⟨p⟩², of a patch that is 0 outside a share of its angles. By the theorem of
-    correlation, the coefficients are the template's conjugate times the patch's, summed over rows.
+    σ² is ⟨p²⟩ − ⟨p⟩². The patch is 0 at hidden angles, and `share` of its angles are visible. By
+    the correlation theorem, the coefficients are the template's conjugate ones times the patch's,
+    summed over the rows.
     """
     factors, levels = _weigh(patch, share, weights)
     shifts, frequencies = len(factors), spectra.shape[2] // 2
@@ -142,10 +146,10 @@ def _multiply(
 
 @compiled
 def _weigh(patch: FloatArray, share: float, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return by shift 1 / (share · σ), and ⟨p⟩ / σ."""
+    """Return 1 / (share · σ) and ⟨p⟩ / σ for each shift."""
     sums = np.zeros((2, len(patch)))
     for r in range(len(patch)):
-        for a in range(0, patch.shape[1], 2):  # two sums each, which do not wait for each other
+        for a in range(0, patch.shape[1], 2):  # two at a time: independent additions are faster
             left, right = patch[r, a], patch[r, a + 1]
             sums[0, r] += left + right
             sums[1, r] += left * left + right * right
@@ -165,10 +169,10 @@ def _weigh(patch: FloatArray, share: float, weights: FloatArray) -> tuple[FloatA
 def _normalise(
     products: SingleArray, moments: SingleArray, visible: BoolArray, levels: FloatArray
 ) -> None:
-    """Turn ⟨i p⟩ / σ (templates · shifts, lags) into scores, where parts are hidden.
+    """Convert ⟨i p⟩ / σ (templates · shifts, lags) to scores, if parts are hidden.
 
-    ⟨i⟩ and ⟨i²⟩ over the visible angles depend on the lag: what the hidden angles hold is taken
-    from the sums all around, which are 0 and 1.
+    ⟨i⟩ and ⟨i²⟩ over the visible angles depend on the lag. They are computed by subtracting the
+    hidden angles from the sums over all angles, which are 0 and 1.
     """
     templates, shifts, angles = len(moments) // 2, len(levels), len(visible)
     sums = np.zeros((2 * templates, angles), np.float32)

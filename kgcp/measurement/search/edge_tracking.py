@@ -1,11 +1,11 @@
-"""Outer edges of dark rings, tracked along rays: one closed curve of few harmonics for each.
+"""Outer edges of dark rings, tracked along rays from a seed.
 
-An outer edge is where the grey values rise most on the way out of the ring. On a single ray that
-may be the rim of a dot, a shadow or clutter. Over all rays, the edge of one ring is a smooth curve
-about its centre: an ellipse whose centre is a little off the seed's, and whose axes differ a
-little, has to first order the distances of `harmonic_curves`, so that a robust linear fit of five
-numbers tells the edge from the others. docs/method.md, "Edge tracking", derives it; `fit_ellipses`
-puts the exact ellipse through what is left.
+The outer edge is where the grey values increase most on the way outwards. On a single ray this may
+also be the rim of a dot, a shadow or clutter. Over all rays, however, the edge of a ring is a
+smooth closed curve: an ellipse that is slightly off the seed's centre and slightly elongated has,
+to first order, the distances that `harmonic_curves` models with five parameters. A robust linear
+fit of these separates the edge from the rest. docs/method.md, "Edge tracking", derives it.
+Afterwards `fit_ellipses` fits the exact ellipse to the edge points that remain.
 """
 
 from __future__ import annotations
@@ -20,41 +20,44 @@ from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
 from kgcp.measurement.search.harmonic_curves import TERMS, fill_in_medians, fit_curves, waves_of
 
-# Tuning of the tracking. Lengths are in units of the seed's radius, which is right to a fifth.
+# Tuning of the tracking. Lengths are relative to the seed's radius, which is accurate to a fifth.
 # The benchmark is `benchmarks.search.hard_frames`; docs/method.md, "Constants of the search", has
-# what it finds with other values.
+# its results with other values.
+# Tracking has two stages. The first uses every second ray and whole pixels: most seeds are not
+# rings, and half of the rays is enough to see that. The second uses all rays, near the first curve.
 RAYS = 40  # a ring of 6 px radius has about as many pixels along its edge
-_RADII = np.arange(0.5, 1.71, 0.04)  # of samples: seeds are good to a fifth, tilts go to 45°
-_STEP = 2  # samples either side that a slope is taken over: as wide as the blur of small rings
-_EVERY = 2  # ray is looked at first: most seeds are not rings, which half of the rays shows
-# Widths of the residuals' weights, pass by pass: wide at first, so that a seed that is off by a
-# quarter of its radius still finds the curve; then as narrow as edges scatter.
-_WIDTHS_AT_FIRST = np.array((0.25, 0.12, 0.07))
+_RADII = np.arange(0.5, 1.71, 0.04)  # of samples; covers seeds off by a fifth, and tilts of 45°
+_HALF_BASE = 2  # samples on either side for a slope; the base is as wide as the blur of small rings
+_FIRST_RAY_STEP = 2
+# Widths of the residual weights, pass by pass. They are wide at first, so that a seed that is off
+# by a quarter of its radius still finds the curve. The last ones correspond to the scatter of
+# edges.
+_FIRST_WIDTHS = np.array((0.25, 0.12, 0.07))
 _WIDTHS = np.array((0.07, 0.05))
-_REACH = 0.17  # of an edge from the first curve; the rises into dots are farther in
-_INLIER = 0.07  # distance from the curve of what counts as its edge, twice that at first
-_MIN_INLIERS, _MIN_INLIERS_AT_FIRST = 0.55, 0.6  # shares: up to 40 % may be hidden
-FINEST_RADIUS_PX = 12.0
-"""Least radius of rings in the image that they are tracked in; in the frame it may be less."""
+_REACH = 0.17  # of the second stage, from the first curve; the rims of dots are farther inside
+_INLIER = 0.07  # largest distance of an edge point from the curve; in the first stage twice that
+_MIN_INLIERS, _FIRST_MIN_INLIERS = 0.55, 0.6  # shares of the rays; up to 40 % may be hidden
+MIN_TRACKED_RADIUS_PX = 12.0
+"""Rings are tracked in the most reduced image in which their radius is at least this."""
 
 _IntArray = npt.NDArray[np.signedinteger[Any]]
 
 RAYS_RAD = 2.0 * np.pi / RAYS * np.arange(RAYS)
-_FEW = RAYS // _EVERY
-_MIDDLES = _RADII[_STEP:-_STEP]
+_FIRST_RAYS = RAYS // _FIRST_RAY_STEP
+_MIDDLES = _RADII[_HALF_BASE:-_HALF_BASE]
 _SPACING = _RADII[1] - _RADII[0]
-_WAVES, _FEW_WAVES = waves_of(RAYS), waves_of(_FEW)
+_WAVES, _FIRST_WAVES = waves_of(RAYS), waves_of(_FIRST_RAYS)
 _HARMONICS = np.stack([np.ones(RAYS), *(f(k * RAYS_RAD) for k in (1, 2) for f in (np.cos, np.sin))])
 
-# For the first look pixels are enough, and single precision, which does twice as many at a time.
-# More samples of a ray, and more rays, fill up vectors.
+# The first stage works in single precision, in which vector instructions handle twice as many
+# numbers. Samples and rays are padded to whole vectors.
 _LANES = 32
-_ROUGH_RADII = np.append(_RADII, np.full(_LANES - len(_RADII), _RADII[-1])).astype(np.float32)
-_ROUGH_DIRECTIONS = _HARMONICS[1:3, ::_EVERY].astype(np.float32)
+_FIRST_RADII = np.append(_RADII, np.full(_LANES - len(_RADII), _RADII[-1])).astype(np.float32)
+_FIRST_DIRECTIONS = _HARMONICS[1:3, ::_FIRST_RAY_STEP].astype(np.float32)
 _SLOPES = len(_MIDDLES)
-# Samples near a curve: of the slopes within reach either side, one more at either end for the
-# parabola, and what the last of them reaches beyond.
-_NEAR = int(2.0 * _REACH / _SPACING) + 1 + 2 + 2 * _STEP
+# Number of samples per ray near a curve: the slopes within reach, one more slope at either end for
+# the parabola, and the base of the slopes.
+_SAMPLES_NEAR = int(2.0 * _REACH / _SPACING) + 1 + 2 + 2 * _HALF_BASE
 
 
 def track_edges(
@@ -64,35 +67,38 @@ def track_edges(
     centres: FloatArray,
     radii: FloatArray,
 ) -> tuple[FloatArray, BoolArray]:
-    """Look for the outer edges of rings: the steepest rises to brighter that lie on a curve.
+    """Find the outer edges of rings: the steepest increases of grey values that lie on one curve.
 
-    Each is tracked in the image in which its radius is 12 to 24 px: there a sample's spacing is
-    half a pixel to one, and reduction has averaged the noise.
+    Each ring is tracked in the image in which its radius is 12 to 24 px. There the samples are half
+    a pixel to one pixel apart, and the reduction has averaged the noise.
 
     Parameters
     ----------
     frame, reduced, levels
-        Of a pyramid.
-    centres, radii : (n, 2) and (n,) array
-        Of the rings in the frame, roughly [px].
+        As in `Pyramid`.
+    centres, radii : (n, 2) and (n,) arrays
+        Approximate centres and radii of the rings in the frame [px].
 
     Returns
     -------
     edges : (n, rays) array
-        How far the edge is from the centre, of the radius.
+        Distances of the edge from the centre, relative to the radius.
     inlying : (n, rays) array of bool
-        Which edges are on the curve; none at all if they are too few for a ring.
+        Which edge points lie on the curve; none if there are too few for a ring.
     """
     count = len(radii)
     curves = np.zeros((TERMS, count))
-    numbers, rises = np.empty((_FEW, count), np.uint8), np.empty((_FEW, count), np.uint8)
-    residuals = np.empty((_FEW, count))
-    _find_rough_edges(frame, reduced, levels, centres, radii, numbers, rises)
+    numbers, rises = (
+        np.empty((_FIRST_RAYS, count), np.uint8),
+        np.empty((_FIRST_RAYS, count), np.uint8),
+    )
+    residuals = np.empty((_FIRST_RAYS, count))
+    _find_first_edges(frame, reduced, levels, centres, radii, numbers, rises)
     fill_in_medians(numbers, curves[0])
     curves[0] = _MIDDLES[0] + _SPACING * curves[0]
-    fit_curves(_MIDDLES[numbers], rises, _FEW_WAVES, _WIDTHS_AT_FIRST, curves, residuals)
+    fit_curves(_MIDDLES[numbers], rises, _FIRST_WAVES, _FIRST_WIDTHS, curves, residuals)
     on_curve = np.count_nonzero(np.abs(residuals) < 2.0 * _INLIER, axis=0)
-    rings = np.flatnonzero(on_curve > _MIN_INLIERS_AT_FIRST * _FEW)
+    rings = np.flatnonzero(on_curve > _FIRST_MIN_INLIERS * _FIRST_RAYS)
 
     near, curves = np.empty((RAYS, len(rings))), curves[:, rings]
     rises, residuals = np.empty((RAYS, len(rings)), np.uint8), np.empty((RAYS, len(rings)))
@@ -110,15 +116,15 @@ def track_edges(
 
 @inlined
 def _octave_of(radius: float, levels: IndexArray) -> int:
-    """Return how often a frame is halved where a ring is tracked."""
-    octave, largest = 0, 2.0 * FINEST_RADIUS_PX
+    """Return how many times the frame is halved to track a ring of this radius [px]."""
+    octave, largest = 0, 2.0 * MIN_TRACKED_RADIUS_PX
     while 2 * octave < len(levels) and radius >= largest:
         octave, largest = octave + 1, 2.0 * largest
     return octave
 
 
 @compiled
-def _find_rough_edges(
+def _find_first_edges(
     frame: GreyArray,
     reduced: GreyArray,
     levels: IndexArray,
@@ -127,22 +133,22 @@ def _find_rough_edges(
     numbers: GreyArray,
     rises: GreyArray,
 ) -> None:
-    """Fill in the numbers of the steepest rises outwards on some of the rays, and the rises."""
-    places, values = np.empty((_FEW, _LANES), np.int32), np.zeros((_LANES, _LANES), np.int16)
+    """Fill in the steepest increases outwards on every second ray: sample numbers and sizes."""
+    places, values = np.empty((_FIRST_RAYS, _LANES), np.int32), np.zeros((_LANES, _LANES), np.int16)
     for i in range(len(radii)):
         octave = _octave_of(radii[i], levels)
         x, y = (centres[i, 0] + 0.5) / 2.0**octave - 0.5, (centres[i, 1] + 0.5) / 2.0**octave - 0.5
         radius, number, rise = radii[i] / 2.0**octave, numbers[:, i], rises[:, i]
-        if octave == 0:  # apart, since the frame may be a read-only array: another type
-            _find_rough_edge(frame, x, y, radius, places, values, number, rise)
+        if octave == 0:  # separate: the frame may be read-only, which is another type for numba
+            _find_first_edge(frame, x, y, radius, places, values, number, rise)
         else:
             at = levels[2 * octave - 2]
             image = reduced[at[0] : at[1]].reshape((at[2], at[3]))
-            _find_rough_edge(image, x, y, radius, places, values, number, rise)
+            _find_first_edge(image, x, y, radius, places, values, number, rise)
 
 
 @compiled
-def _find_rough_edge(
+def _find_first_edge(
     image: GreyArray,
     x: float,
     y: float,
@@ -152,37 +158,38 @@ def _find_rough_edge(
     number: GreyArray,
     rise: GreyArray,
 ) -> None:
-    """Find the steepest rise outwards on some of the rays, in the pixels as they are.
+    """Find the steepest increase outwards on every second ray, without interpolation.
 
-    Addresses first, then grey values, then slopes: only the second cannot be vectorised, and a
-    vector of what has just been stored one by one would have to wait for it. The steepest slope is
-    found as one number: 32 times the slope, and so much less the farther out it is that of equal
-    slopes the first is the largest.
+    There are separate loops for addresses, grey values and slopes. Only that for grey values cannot
+    be vectorised.
+
+    Slope and position are compared as one integer: 32 times the slope plus a countdown of the
+    position, so that the innermost of equal slopes is the largest number.
     """
     pixels, width = image.reshape(-1), np.int32(image.shape[1])
     last_x, last_y = np.int32(width - 1), np.int32(image.shape[0] - 1)
     column, row = np.int32(math.floor(x + 0.5)), np.int32(math.floor(y + 0.5))
     rest_x, rest_y = np.float32(x + 0.5 - column), np.float32(y + 0.5 - row)
-    for k in range(_FEW):
-        dx = np.float32(radius) * _ROUGH_DIRECTIONS[0, k]
-        dy = np.float32(radius) * _ROUGH_DIRECTIONS[1, k]
+    for k in range(_FIRST_RAYS):
+        dx = np.float32(radius) * _FIRST_DIRECTIONS[0, k]
+        dy = np.float32(radius) * _FIRST_DIRECTIONS[1, k]
         for j in range(_LANES):
-            # Each result is cast: sums of 32 bits would be of 64, and take twice the vectors.
-            at_x = np.int32(column + np.int32(np.floor(rest_x + _ROUGH_RADII[j] * dx)))
-            at_y = np.int32(row + np.int32(np.floor(rest_y + _ROUGH_RADII[j] * dy)))
+            # Results are cast because numba widens sums to 64 bits, which take twice the vectors.
+            at_x = np.int32(column + np.int32(np.floor(rest_x + _FIRST_RADII[j] * dx)))
+            at_y = np.int32(row + np.int32(np.floor(rest_y + _FIRST_RADII[j] * dy)))
             at_x = min(max(at_x, np.int32(0)), last_x)
             at_y = min(max(at_y, np.int32(0)), last_y)
             places[k, j] = np.int32(np.int32(at_y * width) + at_x)
-    for k in range(_FEW):
+    for k in range(_FIRST_RAYS):
         for j in range(_LANES):
             values[j, k] = pixels[np.uint32(places[k, j])]
     steepest = np.full(_LANES, np.int16(-(2**15)))
     for j in range(_SLOPES):
-        outer, inner, countdown = values[j + 2 * _STEP], values[j], np.int16(_SLOPES - 1 - j)
+        outer, inner, countdown = values[j + 2 * _HALF_BASE], values[j], np.int16(_SLOPES - 1 - j)
         for k in range(_LANES):
             slope = np.int16(np.int16(32 * np.int16(outer[k] - inner[k])) + countdown)
             steepest[k] = max(steepest[k], slope)
-    for k in range(_FEW):
+    for k in range(_FIRST_RAYS):
         number[k] = _SLOPES - 1 - steepest[k] % 32
         rise[k] = max(steepest[k] >> 5, 0)
 
@@ -198,18 +205,18 @@ def _find_edges_near(
     edges: FloatArray,
     rises: GreyArray,
 ) -> None:
-    """Fill in the steepest rises outwards near curves, on all rays: (rays, n)."""
+    """Fill in the steepest increases outwards near curves, on all rays: (rays, n)."""
     work = (
-        np.empty((_NEAR, RAYS), np.int32),
-        np.empty((2, _NEAR, RAYS)),
-        np.empty((4, _NEAR, RAYS), np.uint8),
-        np.empty((_NEAR, RAYS)),
+        np.empty((_SAMPLES_NEAR, RAYS), np.int32),
+        np.empty((2, _SAMPLES_NEAR, RAYS)),
+        np.empty((4, _SAMPLES_NEAR, RAYS), np.uint8),
+        np.empty((_SAMPLES_NEAR, RAYS)),
     )
     for i in range(len(radii)):
         octave = _octave_of(radii[i], levels)
         x, y = (centres[i, 0] + 0.5) / 2.0**octave - 0.5, (centres[i, 1] + 0.5) / 2.0**octave - 0.5
         radius, curve, edge, rise = radii[i] / 2.0**octave, curves[:, i], edges[:, i], rises[:, i]
-        if octave == 0:  # apart, since the frame may be a read-only array: another type
+        if octave == 0:  # separate: the frame may be read-only, which is another type for numba
             _find_edge_near(frame, x, y, radius, curve, work, edge, rise)
         else:
             at = levels[2 * octave - 2]
@@ -228,10 +235,10 @@ def _find_edge_near(
     edge: FloatArray,
     rise: GreyArray,
 ) -> None:
-    """Find the steepest rise outwards within reach of a curve on all rays, between samples.
+    """Find the steepest increase outwards near a curve on all rays, to a fraction of a sample.
 
-    Three slopes around the steepest give a parabola, whose maximum is the edge. Its rise is no more
-    than a weight, and is rounded to a grey value.
+    The edge is the maximum of a parabola through the steepest slope and its two neighbours. The
+    size of the increase only serves as a weight, so it is rounded to whole grey values.
     """
     places, parts, corners, values = work
     first, last = np.empty(RAYS, np.int32), np.empty(RAYS, np.int32)
@@ -246,12 +253,12 @@ def _find_edge_near(
     for k in range(RAYS):
         if first[k] > last[k]:
             continue
-        best, top = 1, values[1 + 2 * _STEP, k] - values[1, k]
+        best, top = 1, values[1 + 2 * _HALF_BASE, k] - values[1, k]
         for j in range(2, last[k] - first[k] + 2):
-            slope = values[j + 2 * _STEP, k] - values[j, k]
+            slope = values[j + 2 * _HALF_BASE, k] - values[j, k]
             best, top = (j, slope) if slope > top else (best, top)
-        left = values[best - 1 + 2 * _STEP, k] - values[best - 1, k]
-        right = values[best + 1 + 2 * _STEP, k] - values[best + 1, k]
+        left = values[best - 1 + 2 * _HALF_BASE, k] - values[best - 1, k]
+        right = values[best + 1 + 2 * _HALF_BASE, k] - values[best + 1, k]
         bend = min(left - 2.0 * top + right, -1e-3)
         beside = min(max(0.5 * (left - right) / bend, -0.5), 0.5)
         edge[k] = _MIDDLES[0] + _SPACING * (first[k] - 1 + best + beside)
@@ -270,15 +277,15 @@ def _sample_rays(
     corners: GreyArray,
     values: FloatArray,
 ) -> None:
-    """Fill in bilinear grey values along all rays; beyond the border the last pixels repeat.
+    """Fill in bilinear grey values along all rays; border pixels are repeated beyond the image.
 
-    The image has two rows and columns at least, as those of a pyramid have.
-    `places` and `parts` keep the pixels above and left of the samples, and how far these are beyond
-    them; `corners` the four pixels around: loops of arithmetic alone are vectorised, one that also
-    reads the image is not.
+    The image must have at least two rows and columns, as all images of a pyramid do. There are
+    separate loops, because only those without memory gathers are vectorised. `places` keeps the
+    pixel above and to the left of each sample, `parts` the sample's offsets from it, and `corners`
+    the four surrounding grey values.
     """
     width, last_x, last_y = np.int32(image.shape[1]), image.shape[1] - 1, image.shape[0] - 1
-    for j in range(_NEAR):
+    for j in range(_SAMPLES_NEAR):
         place, right, below = places[j], parts[0, j], parts[1, j]
         for k in range(RAYS):
             rho = radius * (_RADII[0] + _SPACING * (first[k] - 1 + j))
@@ -289,13 +296,13 @@ def _sample_rays(
             place[k] = np.int32(np.int32(top * width) + left)
             right[k], below[k] = column - left, row - top
     pixels = image.reshape(-1)
-    for j in range(_NEAR):
+    for j in range(_SAMPLES_NEAR):
         for k in range(RAYS):
             above = np.uintp(np.uint32(places[j, k]))
             below = above + np.uintp(image.shape[1])
             corners[0, j, k], corners[1, j, k] = pixels[above], pixels[above + np.uintp(1)]
             corners[2, j, k], corners[3, j, k] = pixels[below], pixels[below + np.uintp(1)]
-    for j in range(_NEAR):
+    for j in range(_SAMPLES_NEAR):
         upper_left, upper_right = corners[0, j], corners[1, j]
         lower_left, lower_right = corners[2, j], corners[3, j]
         value, right, below = values[j], parts[0, j], parts[1, j]
@@ -306,10 +313,10 @@ def _sample_rays(
 
 
 @inlined
-def _clamp(value: float, most: float) -> float:
-    """Return a value in 0…`most`; `min` and `max` check for NaN, which keeps loops from vectors."""
+def _clamp(value: float, upper: float) -> float:
+    """Limit a value to 0…`upper`; `min` and `max` check for NaN, which prevents vectorisation."""
     if value < 0.0:
         return 0.0
-    if value > most:
-        return most
+    if value > upper:
+        return upper
     return value

@@ -1,16 +1,14 @@
-"""Closed curves of few harmonics through edges on rays, robustly: many curves at once.
+"""Robust fits of closed curves with few harmonics to edges on rays, for many curves at once.
 
-To first order, an ellipse about a point near its centre has the distances
+To first order, an ellipse has these distances from a point near its centre:
 
     ρ(θ) = c₀ + c₁ cos θ + c₂ sin θ + c₃ cos 2θ + c₄ sin 2θ
 
-Sums of weights times products of these functions are sums of weights times cosines and sines of up
-to 4θ: cos θ · cos 2θ is half of cos θ + cos 3θ, and so on. So nine sums make the normal matrix, not
-fifteen.
+Products of these functions are sums of cosines and sines up to 4θ: cos θ · cos 2θ is half of cos θ
++ cos 3θ, and so on. So the normal matrix follows from nine weighted sums instead of fifteen.
 
-The operations of a single fit depend on each other, so that the processor mostly waits. Therefore
-curves stand side by side in all arrays, and each step is one loop over many of them, of which the
-processor takes several at once.
+The steps of a single fit depend on each other, so that the processor would mostly wait. Therefore
+many curves are fitted side by side: each step is a loop over curves, which is vectorised.
 """
 
 from __future__ import annotations
@@ -23,16 +21,16 @@ from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import FloatArray, GreyArray
 
 TERMS = 5
-"""Numbers of a curve: the constant, then cosine and sine of θ and of 2θ."""
+"""Number of a curve's parameters: the constant, cosine and sine of θ, cosine and sine of 2θ."""
 
-_SUMS = 9  # of weights: with 1, then with cosine and sine of θ to 4θ
-_IS_ODD = np.array((0, 1, 1, 0, 0, 1, 1, 0, 0))  # a wave's order
-_TOGETHER = 64  # curves whose sums stay in the processor's cache
-_RIDGE = 1e-3  # keeps the curve through few edges near the mean circle
+_SUMS = 9  # weighted sums of 1 and of cosine and sine of θ to 4θ
+_IS_ODD = np.array((0, 1, 1, 0, 0, 1, 1, 0, 0))  # whether the order of each function is odd
+_BATCH = 64  # curves that are fitted together; their sums stay in the processor's cache
+_RIDGE = 1e-3  # keeps the curve close to a circle if there are few edges
 
 
 def waves_of(rays: int) -> FloatArray:
-    """Return what `fit_curves` needs of rays of equal angles: (9, rays / 2), 1 and eight waves."""
+    """Return (9, rays / 2): 1, cosine and sine of θ to 4θ on the first half of equidistant rays."""
     orders = np.arange(1, 5)[:, None] * (2.0 * np.pi / rays * np.arange(rays // 2))
     waves = np.stack((np.cos(orders), np.sin(orders)), axis=1).reshape(8, -1)
     return np.concatenate((np.ones((1, rays // 2)), waves))
@@ -47,38 +45,38 @@ def fit_curves(
     curves: FloatArray,
     residuals: FloatArray,
 ) -> None:
-    """Fit curves to edges on rays; strong edges near its curve count most.
+    """Fit curves to edges on rays, by iteratively reweighted least squares.
 
-    Least squares, reweighted with min(strength / median, 1) / (1 + (residual / width)²)² for each
-    of the widths (Geman and McClure's function). They become narrower, so that the first curves are
-    drawn by all edges, and the last by those of the ring alone.
+    The weights are min(strength / median, 1) / (1 + (residual / width)²)² (Geman and McClure's
+    function). There is one pass for each width. The widths decrease, so that all edges determine
+    the first curves, and only those of the ring the last ones.
 
     Parameters
     ----------
     edges : (rays, n) array
-        Distances. The rays have equal angles, and their number is even.
+        Distances of the edges. The rays are equidistant in angle, and their number is even.
     strengths : (rays, n) array of uint8
-        How clear they are.
+        Slopes of the edges.
     waves : (9, rays / 2) array
-        By `waves_of`.
+        Result of `waves_of`.
     widths : (passes,) array
-        Of distances.
+        In the unit of the distances.
     curves : (5, n) array
-        At first where the fit starts, then what it ends with.
+        Initial parameters; replaced by the result.
     residuals : (rays, n) array
-        Filled in: the edges' distances less the curves'.
+        Filled in: distances of the edges minus those of the curves.
     """
     rays, count = edges.shape
-    typical, strong = np.empty(_TOGETHER), np.empty((rays, _TOGETHER))
-    sums, lower = np.empty((_SUMS + TERMS, _TOGETHER)), np.empty((TERMS, TERMS, _TOGETHER))
-    for begin in range(0, count, _TOGETHER):
-        end = min(begin + _TOGETHER, count)
+    typical, strong = np.empty(_BATCH), np.empty((rays, _BATCH))
+    sums, lower = np.empty((_SUMS + TERMS, _BATCH)), np.empty((TERMS, TERMS, _BATCH))
+    for begin in range(0, count, _BATCH):
+        end = min(begin + _BATCH, count)
         some, clear = edges[:, begin:end], strengths[:, begin:end]
         curve, residual = curves[:, begin:end], residuals[:, begin:end]
         fill_in_medians(clear, typical)
         for k in range(rays):
             for i in range(end - begin):
-                strong[k, i] = _share(float(clear[k, i]), typical[i])
+                strong[k, i] = _strength_weight(float(clear[k, i]), typical[i])
         _subtract(some, waves, curve, residual)
         for width in widths:
             _add_up(some, residual, strong, waves, width, sums)
@@ -88,8 +86,8 @@ def fit_curves(
 
 
 @inlined
-def _share(strength: float, typical: float) -> float:
-    """Return an edge's weight by its strength; `min` would check for NaN and prevent vectors."""
+def _strength_weight(strength: float, typical: float) -> float:
+    """Return min(strength / typical, 1); `min` checks for NaN, which prevents vectorisation."""
     if strength > typical:
         return 1.0
     return strength / (typical + 1e-6)
@@ -99,7 +97,7 @@ def _share(strength: float, typical: float) -> float:
 def _subtract(
     edges: FloatArray, waves: FloatArray, curves: FloatArray, residuals: FloatArray
 ) -> None:
-    """Fill in how far edges are from curves."""
+    """Fill in the residuals of edges from curves."""
     a, b, c, d, e = curves
     half = len(edges) // 2
     for k in range(half):
@@ -122,13 +120,13 @@ def _add_up(
     width: float,
     sums: FloatArray,
 ) -> None:
-    """Fill in sums over the rays: weights times nine waves, then weighted edges times five.
+    """Fill in sums over the rays: of weights times nine waves, of weighted edges times five waves.
 
-    Waves of an even order are the same on opposite rays, those of an odd one have other signs.
+    Waves of even order are equal on opposite rays; those of odd order have opposite signs.
     """
     count, half = edges.shape[1], len(edges) // 2
-    weights = np.empty((2, count))  # of opposite rays, then times their edges
-    parts = np.empty((2, count))  # sum and difference of the two
+    weights = np.empty((2, count))  # of two opposite rays; later multiplied by their edges
+    parts = np.empty((2, count))  # their sum and difference
     sums[:] = 0.0
     for k in range(half):
         _weigh(residuals[k], strong[k], width, weights[0])
@@ -168,9 +166,9 @@ def _add_product(out: FloatArray, values: FloatArray, factor: float) -> None:
 
 @compiled
 def _decompose(sums: FloatArray, lower: FloatArray) -> None:
-    """Fill in Cholesky's triangles of the normal matrices, with reciprocal diagonals.
+    """Fill in Cholesky factors of the normal matrices, with reciprocal diagonal elements.
 
-    By hand because a call of LAPACK for five unknowns costs several times as much.
+    Written out because calling LAPACK for five unknowns takes several times as long.
     """
     constant, cosine, sine, cosine_2, sine_2, cosine_3, sine_3, cosine_4, sine_4 = sums[:_SUMS]
     for i in range(sums.shape[1]):
@@ -198,7 +196,7 @@ def _decompose(sums: FloatArray, lower: FloatArray) -> None:
 
 @compiled
 def _solve(sums: FloatArray, lower: FloatArray, curves: FloatArray) -> None:
-    """Fill in what solves the normal equations, forwards and backwards through the triangles."""
+    """Solve the normal equations by forward and backward substitution."""
     for a in range(TERMS):
         unknown, right = curves[a], sums[_SUMS + a]
         for i in range(len(unknown)):
@@ -226,9 +224,10 @@ def _multiply(out: FloatArray, factor: FloatArray) -> None:
 
 @compiled
 def fill_in_medians(values: GreyArray, medians: FloatArray) -> None:
-    """Fill in medians (n,) over the rays, counting for each value (rays, n) how many are less.
+    """Fill in the medians (n,) of values (rays, n) over the rays.
 
-    For so few bytes, n² comparisons in vector units are faster than sorting.
+    For each value, the smaller ones are counted. For so few bytes, vectorised comparisons of all
+    pairs are faster than sorting.
     """
     rays, count = values.shape
     most = np.uint8(rays // 2)

@@ -1,6 +1,6 @@
-"""From a ring with the right code to the pose that the measurement starts from.
+"""The pose from which the adjustment starts, for a ring with the right code.
 
-docs/method.md, "The start", describes it.
+docs/method.md, "The start", describes the method.
 """
 
 from __future__ import annotations
@@ -26,42 +26,45 @@ from kgcp.measurement.search.code_signal import (
     match_code,
     points_of_code,
 )
-from kgcp.measurement.search.edge_tracking import FINEST_RADIUS_PX
-from kgcp.measurement.search.sampling import FAINTEST_SLOPE, sample_ellipses, sample_grey
-from kgcp.measurement.search.template_match import code_in_even_light
+from kgcp.measurement.search.edge_tracking import MIN_TRACKED_RADIUS_PX
+from kgcp.measurement.search.sampling import MIN_EDGE_SLOPE, sample_ellipses, sample_grey
+from kgcp.measurement.search.template_match import light_corrected_code
 from kgcp.targets.layout import Target
 
-# Tuning of the start. The adjustment corrects all of it; a start that is worse costs rounds, and
-# beyond some per cent of the distance frames (`benchmarks.accuracy.presets`, CPU time and found).
-_REACH_PX, _STEP_PX = 3.0, 0.2  # of the profile across an edge
-_MAX_TURN_DEG = 8.0  # by which a heading of the search may be off
-_AXIS_ERROR_PX = 0.3  # of an outline
-_CLEAR_CODE = 0.85  # score below which uneven light may be what makes the code unlike itself
-# Of a ring from here on, a pixel of the image that its outline comes from is four pixels or more.
-# Outlines were off by up to 2 px there, starts tilted the wrong way by 15°, and two of 240 plates
-# in sharpened frames came to rest 0.4 % off, at 2 and 3 σ.
-_LARGE_PX = 4.0 * FINEST_RADIUS_PX
-_OUTLINE_REACH, _OUTLINE_SAMPLES = 0.045, 33  # of the profile: in radii, and how many
-_RISE = 6  # samples over which the grey values rise
-_FAINT_RISE = 0.3  # of the typical one: shade leaves more, what hides the edge less
-_OUTLINE_REFITS, _STRAY = 2, 3.0  # medians from the ellipse, beyond which it is no edge of the ring
+# Tuning of the start. The adjustment corrects its errors. A worse start costs iterations, and
+# frames are lost if the distance is off by more than some per cent. The benchmark is
+# `benchmarks.accuracy.presets`: CPU time and number of targets found.
+_REACH_PX, _STEP_PX = 3.0, 0.2  # half length and spacing of the profile across an edge
+_MAX_TURN_DEG = 8.0  # largest error of the search's heading that is corrected
+_AXIS_ERROR_PX = 0.3  # of the outline's semi-axes
+_CLEAR_CODE_SCORE = 0.85  # below, the code is also compared with the light corrected
+# The outline of larger rings is refined in the frame. The search tracks them in an image whose
+# pixels are four or more frame pixels wide. Without refinement, outlines were off by up to 2 px and
+# starts were tilted the wrong way by 15°. In sharpened frames, two of 240 plates then ended at
+# distances that were 0.4 % off, 2 and 3 σ.
+_MIN_REFINED_RADIUS_PX = 4.0 * MIN_TRACKED_RADIUS_PX
+_REFINE_REACH, _REFINE_SAMPLES = 0.045, 33  # half length of the profiles, in radii; samples on each
+_RISE_SAMPLES = 6  # over which the increase of the grey values is measured
+_MIN_RISE = 0.3  # relative to the median one; shade leaves more, an occluded edge has less
+# Edge points are dropped if their distance from the ellipse is more than so many medians.
+_REFITS, _MAX_STRAY = 2, 3.0
 
-_OUTLINE_RAD = CODE_ANGLES_RAD[::5]  # of an ellipse enough points give its undistorted image
+_OUTLINE_RAD = CODE_ANGLES_RAD[::5]  # enough points of the outline to undistort it
 _EVERYWHERE = np.ones(len(_OUTLINE_RAD), dtype=bool)
 _EDGE_RAD, _EDGE = CODE_ANGLES_RAD[::4], CODE_CIRCLE[::4]
 
 
 def initial_pose(grey: GreyArray, camera: Camera, target: Target, match: CodeMatch) -> InitialPose:
-    """Return the better one of the two poses that the outline of a matched ring has.
+    """Return the better of the two poses that explain the outline of a matched ring.
 
-    The outline is good to some tenths of a pixel, and the image model needs no more.
+    The outline is accurate to some tenths of a pixel, which is enough for the image model.
 
     Raises
     ------
     Rejection
-        POOR_ELLIPSE, if the outline lies beyond the lens model's reach.
+        POOR_ELLIPSE if the outline lies beyond the reach of the distortion model.
     """
-    match = replace(match, outer=_at_full_size(grey, match))
+    match = replace(match, outer=_refined_outline(grey, match))
     ring = match.ring
     towards = camera.undistort(match.outer.points(math.radians(match.lag_deg) + _OUTLINE_RAD))
     cone = _ellipse_through(towards, _EVERYWHERE)
@@ -73,8 +76,8 @@ def initial_pose(grey: GreyArray, camera: Camera, target: Target, match: CodeMat
     ]
     codes = sample_grey(grey, np.array([points_of_code(camera, pose, ring) for pose in poses]))
     scores, lags_deg = match_code(codes, ring)
-    if scores.max() < _CLEAR_CODE:
-        even = [code_in_even_light(grey, camera, pose, ring) for pose in poses]
+    if scores.max() < _CLEAR_CODE_SCORE:
+        even = [light_corrected_code(grey, camera, pose, ring) for pose in poses]
         if all(code is not None for code in even):
             even_scores, even_lags_deg = match_code(np.array(even), ring)
             if even_scores.max() > scores.max():
@@ -82,15 +85,16 @@ def initial_pose(grey: GreyArray, camera: Camera, target: Target, match: CodeMat
     best = int(scores.argmax())
     turn_deg = (float(lags_deg[best]) + 180.0) % 360.0 - 180.0
     pose = poses[best]
-    if abs(turn_deg) < _MAX_TURN_DEG:  # otherwise something hides the code, as the search knows
+    if abs(turn_deg) < _MAX_TURN_DEG:  # else the code is partly hidden: keep the search's heading
         pose = pose.turned(turn_deg)
-    # At a tilt of 0 the image does not change with it, to first order: an adjustment that starts
-    # there stays there. So the start is tilted by what the outline cannot tell from 0.
+    # At a tilt of 0 the image does not depend on the tilt to first order, so that an adjustment
+    # would never leave it. Therefore the start has at least the tilt that the outline cannot
+    # distinguish from 0.
     pose = pose.tilted(math.acos(max(0.0, 1.0 - _AXIS_ERROR_PX / match.outer.mean_radius)))
     outer_px, outer_slope = _edge_of_profile(grey, match, ring.outer_diameter_m)
     inner_px, _ = _edge_of_profile(grey, match, ring.inner_diameter_m)
     contrast = match.white - match.black
-    slope = max(outer_slope, FAINTEST_SLOPE)
+    slope = max(outer_slope, MIN_EDGE_SLOPE)
     shift_px = (inner_px - ring.inner_ratio * outer_px) / (1.0 + ring.inner_ratio)
     return InitialPose(
         ring=ring.name,
@@ -102,38 +106,39 @@ def initial_pose(grey: GreyArray, camera: Camera, target: Target, match: CodeMat
     )
 
 
-def _at_full_size(grey: GreyArray, match: CodeMatch) -> Ellipse:
-    """Return the outline as the frame itself shows it; large ones come from a reduced image.
+def _refined_outline(grey: GreyArray, match: CodeMatch) -> Ellipse:
+    """Return the outline of a large ring, refined in the frame; that of a small one as it is.
 
-    The edge is where grey values rise most along the rays, except for those that hardly rise and
-    those far from an ellipse through all others.
+    The search has tracked large rings in a reduced image. Here the edge is where grey values
+    increase most along rays clear of dots. Rays with a small increase, and points far from the
+    ellipse through the others, are left out.
     """
     ring, outline = match.ring, match.outer
     radius_px = outline.mean_radius
-    if radius_px < _LARGE_PX:
+    if radius_px < _MIN_REFINED_RADIUS_PX:
         return outline
-    factors = 1.0 + np.linspace(-_OUTLINE_REACH, _OUTLINE_REACH, _OUTLINE_SAMPLES)
+    factors = 1.0 + np.linspace(-_REFINE_REACH, _REFINE_REACH, _REFINE_SAMPLES)
     px_per_m = 2.0 * radius_px / ring.outer_diameter_m
     clear = clear_of_dots(_EDGE_RAD, ring, ring.outer_diameter_m, match.lag_deg, px_per_m)
     values = sample_ellipses(grey, (outline,), factors, _EDGE[clear])[0]
-    rises = values[_RISE:] - values[:-_RISE]
-    at = factors[rises.argmax(axis=0)] + 0.5 * (factors[_RISE] - factors[0])
-    points = outline.centre + at[:, None] * (outline.points(_EDGE_RAD[clear]) - outline.centre)
+    rises = values[_RISE_SAMPLES:] - values[:-_RISE_SAMPLES]
+    edges = factors[rises.argmax(axis=0)] + 0.5 * (factors[_RISE_SAMPLES] - factors[0])
+    points = outline.centre + edges[:, None] * (outline.points(_EDGE_RAD[clear]) - outline.centre)
     steepest = rises.max(axis=0)
-    seen = steepest > _FAINT_RISE * np.median(steepest)
+    seen = steepest > _MIN_RISE * np.median(steepest)
     fitted = _ellipse_through(points, seen)
-    for _ in range(_OUTLINE_REFITS):
+    for _ in range(_REFITS):
         if fitted is None:
             return outline
         on_circle = np.linalg.solve(fitted.stretch, (points - fitted.centre).T)
         off = np.abs(np.hypot(*on_circle) - 1.0)
-        seen &= off <= _STRAY * np.median(off[seen])
+        seen &= off <= _MAX_STRAY * np.median(off[seen])
         fitted = _ellipse_through(points, seen)
     return outline if fitted is None else fitted
 
 
 def _ellipse_through(points: FloatArray, seen: BoolArray) -> Ellipse | None:
-    """Fit an ellipse to some of the points (n, 2) all around; None if there is none."""
+    """Fit an ellipse to those points (n, 2) that are seen (n,); None if no ellipse fits."""
     lengths, directions = np.empty((1, len(points))), np.empty_like(points)
     x, y, unit = _measure_spokes(points, lengths[0], directions)
     ellipses, shares = np.empty((1, 5)), np.empty(1)
@@ -148,9 +153,9 @@ def _ellipse_through(points: FloatArray, seen: BoolArray) -> Ellipse | None:
 def _measure_spokes(
     points: FloatArray, lengths: FloatArray, directions: FloatArray
 ) -> tuple[float, float, float]:
-    """Fill in how far and in which direction points are from their mean, which is returned.
+    """Fill in lengths and unit vectors from the mean of points to the points.
 
-    The unit of the lengths is their mean, which is returned, too.
+    Returned are x and y of the mean, and the mean length, which is the unit of the lengths.
     """
     x, y, unit, count = 0.0, 0.0, 0.0, len(points)
     for i in range(count):
@@ -168,9 +173,9 @@ def _measure_spokes(
 def _edge_of_profile(
     grey: GreyArray, match: CodeMatch, edge_diameter_m: float
 ) -> tuple[float, float]:
-    """Return where the mean grey values along the radii change most at an edge, and by how much.
+    """Return radius [px] and slope [grey values per px] of an edge.
 
-    The first is a radius [px], the second in grey values per pixel.
+    They are those of the steepest place in the mean profile over all directions clear of dots.
     """
     ring, outline = match.ring, match.outer
     share = edge_diameter_m / ring.outer_diameter_m
@@ -187,7 +192,10 @@ def _edge_of_profile(
 
 @compiled
 def _steepest(values: FloatArray, sign: float) -> tuple[int, float]:
-    """Return where the means of some rows rise most, or fall with −1, and by how much per row."""
+    """Return the row at which the row means increase most, and the increase per row.
+
+    With a `sign` of −1, where they decrease most.
+    """
     rows, angles = values.shape
     means = np.zeros(rows)
     for r in range(rows):

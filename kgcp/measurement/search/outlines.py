@@ -1,6 +1,7 @@
-"""From candidate places to the ellipses of outer edges, one for each ring.
+"""The ellipses of the outer edges of all dark rings in a frame.
 
-Ring filter, ring check, edge tracking and ellipse fit in turn; circles that are alike are one.
+Ring filter, ring check, edge tracking and ellipse fit are applied in turn. Of circles that are
+alike, only the clearest is kept.
 """
 
 from __future__ import annotations
@@ -15,17 +16,21 @@ from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.ellipse_fit import fit_ellipses
 from kgcp.measurement.search.edge_tracking import RAYS_RAD, track_edges
-from kgcp.measurement.search.pyramid import Pyramid, factor_of
+from kgcp.measurement.search.pyramid import Pyramid, reduction_factor
 from kgcp.measurement.search.ring_check import check_peaks
 from kgcp.measurement.search.ring_filter import PEAK_RADIUS_PX, find_peaks
 
-# Tuning: two seeds, or outlines, are the same ring if their centres are nearer than this, of the
-# radius, and the logarithms of their radii. Narrower limits leave more of them to track, and cost
-# time (`benchmarks.speed.relative_costs`); wider ones take a replica for the ring around it.
+# Tuning. Two seeds, or two outlines, are the same ring if the distance of their centres is below
+# the first limit (relative to the clearer one's radius) and the difference of the logarithms of
+# their radii below the second. With narrower limits more of them are left to be tracked, which
+# costs time (`benchmarks.speed.relative_costs`). With wider limits a replica is taken for the ring
+# around it.
 _NEAR_SEEDS, _ALIKE_SEEDS = 0.3, 0.25
 _NEAR_OUTLINES, _ALIKE_OUTLINES = 0.25, 0.15
-_SMALLEST_RATIO = 0.93  # of the radii that a level is searched for to the one of its peaks
-_MAX_AXIS_RATIO = 2.0  # tilts to 60°
+# A level is searched if the radius that its peaks stand for is at least this share of the smallest
+# radius that is looked for.
+_MIN_RADIUS_SHARE = 0.93
+_MAX_AXIS_RATIO = 2.0  # corresponds to a tilt of 60°
 
 _DIRECTIONS = np.stack((np.cos(RAYS_RAD), np.sin(RAYS_RAD)), axis=-1)
 
@@ -33,16 +38,16 @@ _DIRECTIONS = np.stack((np.cos(RAYS_RAD), np.sin(RAYS_RAD)), axis=-1)
 def non_max_suppression(
     centres: FloatArray, radii: FloatArray, clearness: FloatArray, near: float, alike: float
 ) -> IndexArray:
-    """Return the indices of circles without those that are like a clearer one, clearest first.
+    """Return the indices of circles that are not similar to a clearer one, the clearest first.
 
     Parameters
     ----------
     centres : (n, 2) array
-    radii, clearness : (n,) array
+    radii, clearness : (n,) arrays
     near : float
-        Distance up to which two circles may be the same, of the clearer one's radius.
+        Largest distance of the centres of similar circles, relative to the clearer one's radius.
     alike : float
-        Difference of the logarithms of their radii up to which they may be.
+        Largest difference of the logarithms of their radii.
     """
     order, by_row = np.argsort(-clearness, kind="stable"), np.argsort(centres[:, 1], kind="stable")
     return order[_is_first(centres, radii, order, by_row, near, alike)[order]]
@@ -57,9 +62,10 @@ def _is_first(
     near: float,
     alike: float,
 ) -> BoolArray:
-    """Return which circles (n,) are like no clearer one, from their orders by clearness and row.
+    """Return which circles (n,) are not similar to a clearer one.
 
-    Neighbours are looked for along the rows, up and down from each circle, as far as it reaches.
+    `order` lists the circles by clearness, `by_row` by the row of their centres. Neighbours are
+    searched in `by_row`, in both directions from each circle as far as it reaches.
     """
     first = np.ones(len(radii), np.bool_)
     position, rank = np.empty(len(radii), np.intp), np.empty(len(radii), np.intp)
@@ -85,25 +91,28 @@ def _is_first(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seeds:
-    """Places that may be a ring's."""
+    """Places where a ring may be."""
 
     centres_px: FloatArray  # (n, 2): in the frame
-    radii_px: FloatArray  # (n,): of the outer circle, to a fifth
-    contrasts: FloatArray  # (n,): grey values by which core and surround are brighter than the ring
+    radii_px: FloatArray  # (n,): of the outer circle, accurate to a fifth
+    contrasts: FloatArray  # (n,): clearness in grey values, from `check_peaks`
 
     def __len__(self) -> int:
-        """Count the places."""
+        """Return the number of seeds."""
         return len(self.radii_px)
 
     def chosen(self, which: IndexArray) -> Seeds:
-        """Return some of the seeds."""
+        """Return the seeds with the given indices."""
         return Seeds(self.centres_px[which], self.radii_px[which], self.contrasts[which])
 
 
 def find_seeds(pyramid: Pyramid, min_radius_px: float) -> Seeds:
-    """Look for rings in all levels that `min_radius_px` needs, and keep the clearest of each."""
+    """Find seeds in all levels that rings from `min_radius_px` on need; similar ones are merged."""
     first, last = 0, len(pyramid.levels)
-    while first < last and factor_of(first) * PEAK_RADIUS_PX < _SMALLEST_RATIO * min_radius_px:
+    while (
+        first < last
+        and reduction_factor(first) * PEAK_RADIUS_PX < _MIN_RADIUS_SHARE * min_radius_px
+    ):
         first += 1
     peaks, ends = find_peaks(pyramid.reduced, pyramid.levels[first:])
     rings = check_peaks(pyramid, peaks, ends)
@@ -115,7 +124,7 @@ def find_seeds(pyramid: Pyramid, min_radius_px: float) -> Seeds:
 def track_outlines(pyramid: Pyramid, seeds: Seeds) -> tuple[Ellipse, ...]:
     """Track the outer edge of every seed's ring and fit an ellipse to it.
 
-    Twice: the centre of a large ring is known to some pixels at first.
+    This is done twice, because the seed of a large ring knows its centre only to some pixels.
     """
     ellipses = np.empty((0, 5))
     for _ in range(2):
@@ -128,10 +137,9 @@ def track_outlines(pyramid: Pyramid, seeds: Seeds) -> tuple[Ellipse, ...]:
 
 
 def _fit_outlines(pyramid: Pyramid, seeds: Seeds) -> FloatArray:
-    """Return centre, semi-axes [px] and direction [rad] of the seeds' outlines, clearest first.
+    """Return centre, semi-axes [px] and direction [rad] of the seeds' outlines, the clearest first.
 
-    Those that agree with a clearer one are dropped. The unit of the edges is the seed's radius, the
-    origin its centre.
+    Outlines that are similar to a clearer one are dropped.
     """
     edges, inlying = track_edges(
         pyramid.frame, pyramid.reduced, pyramid.levels, seeds.centres_px, seeds.radii_px
@@ -140,6 +148,7 @@ def _fit_outlines(pyramid: Pyramid, seeds: Seeds) -> FloatArray:
     fit_ellipses(edges, inlying, _DIRECTIONS, _MAX_AXIS_RATIO, ellipses, shares)
     good = np.flatnonzero(shares)
     ellipses, seeds, shares = ellipses[good], seeds.chosen(good), shares[good]
+    # edges are relative to the seed's centre and radius
     ellipses[:, :4] *= seeds.radii_px[:, None]
     ellipses[:, :2] += seeds.centres_px
     radii, centres = np.sqrt(ellipses[:, 2:4].prod(axis=1)), np.ascontiguousarray(ellipses[:, :2])

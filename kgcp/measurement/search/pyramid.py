@@ -1,7 +1,8 @@
-"""A frame in 8 bits and what is made of it: images of a half, a third, a quarter, … of its size.
+"""An image pyramid: a frame in 8 bits, reduced to a half, a third, a quarter, … of its size.
 
-Levels are 1.33 and 1.5 apart, so that every ring has a radius between 2.5 and 3.75 px in some of
-them: there the ring filter answers. All are in one array, so that one compiled loop goes through.
+Successive levels differ in size by factors of 1.5 and 1.33. So every ring has a radius between 2.5
+and 3.75 px in some level, to which the ring filter responds. All levels are in one array, so that a
+single compiled loop can process them.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import GreyArray, IndexArray
 from kgcp.geometry.grey_range import brightest_level
 
-_SMALLEST_PX = 6
+_MIN_SIZE_PX = 6  # of the smallest reduced image
 
 _Sums = npt.NDArray[np.uint16]
 
@@ -27,26 +28,26 @@ class Pyramid:
     """A frame and its reduced images."""
 
     frame: GreyArray  # (height, width): contiguous
-    # (n,): the reduced images row by row, one behind the other: their pixels are 2, 3, 4, 6, 8, …
-    # pixels of the frame wide
+    # (n,): the reduced images, row by row, one after the other. Their pixels are 2, 3, 4, 6, 8, …
+    # frame pixels wide.
     reduced: GreyArray
-    levels: IndexArray  # (m, 4): of each of them: begin and end in `reduced`, height, width
+    levels: IndexArray  # (m, 4): start and end in `reduced`, height and width of each image
 
 
-def factor_of(level: int) -> float:
-    """Return how many pixels of the frame a pixel of a reduced image is wide."""
+def reduction_factor(level: int) -> float:
+    """Return the width of a level's pixels in frame pixels."""
     return 2.0 ** (level // 2) * (2.0, 3.0)[level % 2]
 
 
 def eight_bit(grey: GreyArray) -> GreyArray:
-    """Return an 8-bit frame for the search, contiguous, with its brightest pixels white."""
+    """Return a frame for the search: 8 bits, contiguous, scaled so that its white is 255."""
     if grey.dtype == np.uint8:
         return np.ascontiguousarray(grey)
     return cv2.convertScaleAbs(grey, alpha=255.0 / brightest_level(grey))
 
 
 def build_pyramid(grey: GreyArray) -> Pyramid:
-    """Return the frame itself in 8 bits and its reduced images, down to some pixels."""
+    """Return the frame in 8 bits and its reduced images, down to a few pixels."""
     levels = _levels_of(*grey.shape)
     reduced = np.empty(levels[-1, 1] if len(levels) else 0, np.uint8)
     pyramid = Pyramid(eight_bit(grey), reduced, levels)
@@ -58,7 +59,7 @@ def build_pyramid(grey: GreyArray) -> Pyramid:
 def _levels_of(height: int, width: int) -> IndexArray:
     table: list[tuple[int, int, int, int]] = []
     end = 0
-    while min(height, width) >= 2 * _SMALLEST_PX:
+    while min(height, width) >= 2 * _MIN_SIZE_PX:
         height, width = height // 2, width // 2
         for lines, columns in ((height, width), (2 * (height // 3), 2 * (width // 3))):
             begin, end = end, end + lines * columns
@@ -75,7 +76,7 @@ def _reduce(frame: GreyArray, reduced: GreyArray, levels: IndexArray) -> None:
         elif i % 2 == 0:
             _halve(_image(reduced, levels, i - 2), image)
         else:
-            _fill_from_three(_image(reduced, levels, i - 1), image)
+            _reduce_to_two_thirds(_image(reduced, levels, i - 1), image)
 
 
 @compiled
@@ -86,7 +87,7 @@ def _image(reduced: GreyArray, levels: IndexArray, i: int) -> GreyArray:
 
 @compiled
 def _halve(image: GreyArray, out: GreyArray) -> None:
-    """Take the means of two rows and columns each."""
+    """Fill in the rounded means of 2 × 2 pixels."""
     for i in range(len(out)):
         upper, lower, line = image[2 * i], image[2 * i + 1], out[i]
         for x in range(len(line)):
@@ -96,8 +97,8 @@ def _halve(image: GreyArray, out: GreyArray) -> None:
 
 
 @compiled
-def _fill_from_three(image: GreyArray, out: GreyArray) -> None:
-    """Reduce three rows and columns to two, interpolating linearly between pixels' centres."""
+def _reduce_to_two_thirds(image: GreyArray, out: GreyArray) -> None:
+    """Reduce three rows and columns to two, by linear interpolation between pixel centres."""
     height, width = out.shape[0] // 2, out.shape[1] // 2
     upper, lower = np.empty(3 * width, np.uint16), np.empty(3 * width, np.uint16)
     for i in range(height):
@@ -111,7 +112,7 @@ def _fill_from_three(image: GreyArray, out: GreyArray) -> None:
 
 @compiled
 def _fill_row(row: _Sums, out: GreyArray) -> None:
-    """Reduce three columns to two; the sums are four times the grey values."""
+    """Reduce three columns to two; the values of `row` are four times grey values."""
     for j in range(len(out) // 2):
         left, middle, right = row[3 * j], row[3 * j + 1], row[3 * j + 2]
         out[2 * j] = np.uint16(3 * left + middle + 8) >> 4

@@ -1,11 +1,13 @@
-"""Grey values on circles around places that may be a ring's: how dark it is, and how even.
+"""The ring check: tests of the filter's peaks by a few samples on concentric circles.
 
-The ring filter also answers to much else. Here few samples per place decide, dark ones on the ring
-and bright ones around it, in more and more directions; most places are dropped after eight. At last
-the samples on the ring, 24, must be of one grey value, and those on core and surround vary no more
-than shade makes them. Order statistics measure that, not means: dots brighten and something in the
-way may hide a part of any circle, which moves the mean and the largest values, but not those of
-lower rank. docs/method.md, "Ring check", has the ranks.
+The ring filter responds to much besides rings. The check first tests whether samples on the ring
+are dark and those around it bright, in eight directions and then in 16; most peaks are dropped
+after eight. Finally 24 samples per circle are compared: those on the ring must be nearly equal, and
+those on core and surround must not vary more than shade explains.
+
+Order statistics are used instead of means. Dots brighten parts of the ring, and objects may hide a
+part of any circle. That changes means and largest values, but not values of lower rank.
+docs/method.md, "Ring check", lists the ranks.
 """
 
 from __future__ import annotations
@@ -21,42 +23,50 @@ from kgcp.measurement.search.pyramid import Pyramid
 from kgcp.measurement.search.ring_filter import PEAK_RADIUS_PX
 
 # Tuning of the check. The benchmark is `benchmarks.search.hard_frames`; docs/method.md, "Constants
-# of the search", has what it finds with other values. Radii are in units of the outer one.
-_RATIOS = np.array((0.76, 1.15, 1.34, 0.33))  # of circles that are sampled
-_RING, _NEAR, _FAR, _CORE = range(4)  # the core's circle is outside of a replica
-_ROUGH = np.array((0.85, 1.1))  # radii that are tried, of the one that the filter answers to most
-_FINE = np.array((0.9, 1.0, 1.1))  # and of each of those
-_FEW, _MANY, _ALL = 8, 16, 24  # directions that are sampled first, then, and at last
-_ENOUGH_OF_FEW, _ENOUGH_OF_MANY = 4, 9  # a hidden quarter and dots leave half
-_MIN_CONTRAST = 5  # grey values: less is noise
-_CLEAR, _CLEAR_LARGE = 0.5, 0.8  # spread of the ring, of the contrast
-_LARGE_PX = 22.0  # radius from which there are so few places that a wider spread costs nothing
-# A surround so many times as bright as the ring beside it counts as bright, even if shade makes it
-# darker than the filter's mean in light.
-_BRIGHTER = 2
-# Spread of core and of surround, and their difference, of the contrast in shade: in a linear image
-# half in shade that takes away half of the light, they are as much as the contrast. They are more
-# in deeper shade, if it falls on both alike: the spread of what they differ by, over half of the
-# directions, of the ring's depth.
-_UNEVEN, _MOST_UNEVEN = 1.2, 4.0
-_MOST_APART = 0.6
-# Order statistics of 24 samples, from 0. Up to a third of the ring may be dots: its typical grey
-# value is of rank 4, and what is even about it lies between the ranks 1 and 8. Of core and surround
-# a third may be dark, hidden or beyond the plate, and only bright ranks tell.
+# of the search", has its results with other values.
+# The sampled circles: their numbers, and their radii relative to the outer one. The surround is
+# sampled on a near and on a far circle. The circle of the core lies outside a replica.
+_RATIOS = np.array((0.76, 1.15, 1.34, 0.33))
+_RING, _NEAR, _FAR, _CORE = range(4)
+# Outer radii that are tried, relative to the radius that the filter responds to most: rough ones,
+# and finer steps around each of them.
+_ROUGH = np.array((0.85, 1.1))
+_FINE = np.array((0.9, 1.0, 1.1))
+_FEW, _MANY, _ALL = 8, 16, 24  # directions of the first, second and final test
+_MIN_OF_FEW, _MIN_OF_MANY = 4, 9  # directions that must pass: a hidden quarter and dots leave half
+_MIN_CONTRAST = 5  # grey values; less is noise
+# Largest spread of the ring, relative to the contrast. Large rings may have more, since there are
+# so few peaks from this radius on that it costs nothing.
+_MAX_RING_SPREAD, _MAX_LARGE_RING_SPREAD = 0.5, 0.8
+_LARGE_PX = 22.0
+# A surround counts as bright if it is so many times as bright as the ring in the same direction. So
+# it is recognised in shade, where it may be darker than the filter's mean.
+_SHADE_RATIO = 2
+# Largest unevenness, relative to the contrast in shade: the largest of the spreads of core and
+# surround and of their difference. In a linear image, half of it in shade that takes half of the
+# light, the unevenness is about as large as the contrast. In deeper shade it is larger. The second
+# limit holds if the shade falls on core and surround alike: over half of the directions, their
+# difference may vary by at most `_MAX_DIFFERENCE_SPREAD` of the ring's depth.
+_MAX_UNEVENNESS, _MAX_SHADE_UNEVENNESS = 1.2, 4.0
+_MAX_DIFFERENCE_SPREAD = 0.6
+# Ranks of 24 samples, counted from 0 at the darkest: low, middle and high. The middle one is the
+# circle's grey value, the difference of the others its spread. Up to a third of the ring may be
+# dots, hence low ranks. Of core and surround, a third may be dark, hidden or beyond the plate,
+# hence high ranks.
 _RING_RANKS = 1, 4, 8
 _CORE_RANKS = 7, 11, 17
 _PLATE_RANKS = 11, 14, 19
 
 _TRIALS = np.outer(_ROUGH, _FINE).ravel()
-_COARSER = np.array((2.0, 3.0))  # pixels of the filtered images, in pixels of the sampled ones
+_COARSER = np.array((2.0, 3.0))  # width of filtered pixels, in pixels of the image that is sampled
 
-_AHEAD = 6  # peaks whose pixels are loaded beforehand; from 4 to 24, times are the same
+_PREFETCH_AHEAD = 6  # peaks whose pixels are prefetched; 4 to 24 take the same time
 
 _Addresses = npt.NDArray[np.uintp]  # (radii, circles, directions)
 
 
 def _offsets(trials: FloatArray, circles: int, *counts: int) -> IndexArray:
-    """Return x and y of samples on circles: (ratios of pixels, 2, radii, circles, directions)."""
+    """Return x and y of samples: (ratios of pixel widths, 2, radii, circles, directions)."""
     angles = np.concatenate([2.0 * np.pi / n * (np.arange(n) + 0.5) for n in counts])
     unit = np.stack((np.cos(angles), np.sin(angles)))[:, None, None]
     radii = PEAK_RADIUS_PX * np.multiply.outer(np.outer(_COARSER, trials), _RATIOS[:circles])
@@ -68,24 +78,27 @@ _FINE_OFFSETS = _offsets(_TRIALS, 4, _MANY, _ALL)
 
 
 def check_peaks(pyramid: Pyramid, peaks: FloatArray, ends: IndexArray) -> FloatArray:
-    """Return the rings among the peaks: ring, core and surround are of one grey value each.
+    """Return the rings among the peaks.
 
-    Each is sampled in an image that is two or three times finer than the one it was found in.
-    Cheap tests come first: dark and then bright in some of eight directions, then in some of 16.
+    Each peak is sampled in an image that is two or three times finer than the one it was found in.
+    The cheapest tests come first: dark then bright in enough of eight directions, then of 16, then
+    the order statistics of 24.
 
     Parameters
     ----------
     peaks, ends
-        As `find_peaks` returns them, of the pyramid's last levels.
+        Results of `find_peaks` for the last levels of the pyramid.
 
     Returns
     -------
     rings : (n, 4) array
-        Centre and outer radius in the frame [px]; contrast in grey values, less the spread.
+        Centre and outer radius in the frame [px]; clearness: the contrast minus half of the ring's
+        spread, in grey values.
     """
     rings = np.empty((len(peaks), 4))
     images = pyramid.frame, pyramid.reduced, pyramid.levels
-    # What depends on another module's constants is passed: compiled code would keep old values.
+    # Values from another module's constants are passed, because the cache of compiled code does not
+    # notice their changes.
     count = _check_all(*images, peaks, ends, _ROUGH_OFFSETS, _FINE_OFFSETS, PEAK_RADIUS_PX, rings)
     return rings[:count]
 
@@ -102,9 +115,10 @@ def _check_all(
     peak_radius: float,
     rings: FloatArray,
 ) -> int:
-    """Fill in what `check_peaks` returns, and count it.
+    """Fill in the result of `check_peaks`, and return the number of rings.
 
-    Where pixels are 2, 3, 4, 6, 8, 12, … of the frame's wide, images of 1, 1, 2, 2, 4, 4, … serve.
+    Peaks of levels whose pixels are 2, 3, 4, 6, 8, 12, … frame pixels wide are sampled in images
+    with pixels of 1, 1, 2, 2, 4, 4, …
     """
     count, begin = 0, 0
     for k in range(len(ends)):
@@ -112,7 +126,7 @@ def _check_all(
         rough, fine = rough_offsets[third], fine_offsets[third]
         factor, coarser = 2.0**octave, 2.0 + third
         part, out = peaks[begin : ends[k]], rings[count:]
-        if octave == 0:  # apart, since the frame may be a read-only array: another type
+        if octave == 0:  # separate: the frame may be read-only, which is another type for numba
             count += _check_level(frame, part, rough, fine, factor, coarser, peak_radius, out)
         else:
             at = levels[2 * octave - 2]
@@ -133,26 +147,26 @@ def _check_level(
     peak_radius: float,
     rings: FloatArray,
 ) -> int:
-    """Check the peaks of one level.
+    """Check the peaks of one level; fill in the rings and return their number.
 
-    A pixel of `image` is `factor` pixels of the frame wide, one of the level `coarser` times that.
-    Samples are read by their distance from the place in the flattened image; only next to the
-    border their addresses are worked out one by one. Large images do not fit into the cache: rows
-    around later peaks are loaded beforehand, which halves the time from 12 Mpx on.
+    A pixel of `image` is `factor` frame pixels wide, and one of the level is `coarser` times that.
+    Samples are addressed by constant steps from the peak in the flattened image; only near the
+    border are their addresses computed one by one. Large images do not fit into the cache.
+    Therefore the rows around later peaks are prefetched, which halves the time from 12 Mpx on.
     """
     height, width = image.shape
     pixels, reach = image.reshape(-1), fine_offsets.max()
     radius = factor * coarser * peak_radius
-    clear = _CLEAR_LARGE if radius >= _LARGE_PX else _CLEAR
+    max_spread = _MAX_LARGE_RING_SPREAD if radius >= _LARGE_PX else _MAX_RING_SPREAD
     rough_steps, fine_steps = _steps(rough_offsets, width), _steps(fine_offsets, width)
     rough_places, fine_places = np.empty_like(rough_steps), np.empty_like(fine_steps)
     values = np.empty((3, _ALL), np.uint8)
     count = 0
     for i in range(len(peaks)):
-        if i + _AHEAD < len(peaks):
-            x = math.floor(coarser * (peaks[i + _AHEAD, 0] + 0.5))
-            y = math.floor(coarser * (peaks[i + _AHEAD, 1] + 0.5))
-            for row in range(y - reach, y + reach + 1):  # a line of the cache is wider than a peak
+        if i + _PREFETCH_AHEAD < len(peaks):
+            x = math.floor(coarser * (peaks[i + _PREFETCH_AHEAD, 0] + 0.5))
+            y = math.floor(coarser * (peaks[i + _PREFETCH_AHEAD, 1] + 0.5))
+            for row in range(y - reach, y + reach + 1):  # a row fits into one or two cache lines
                 prefetch(pixels, row * width + x - reach)
                 prefetch(pixels, row * width + x + reach)
         x = math.floor(coarser * (peaks[i, 0] + 0.5))  # the pixel that holds the point
@@ -169,7 +183,7 @@ def _check_level(
         if not inside:
             _keep_inside(fine_offsets, x, y, width, height, fine_places)
         samples = fine_steps if inside else fine_places
-        clearness, trial = _clearest(pixels, at, samples, rough, dark, bright, clear, values)
+        clearness, trial = _clearest(pixels, at, samples, rough, dark, bright, max_spread, values)
         if clearness > 0.0:
             rings[count, 0] = factor * coarser * (peaks[i, 0] + 0.5) - 0.5
             rings[count, 1] = factor * coarser * (peaks[i, 1] + 0.5) - 0.5
@@ -180,9 +194,9 @@ def _check_level(
 
 @compiled
 def _steps(offsets: IndexArray, width: int) -> _Addresses:
-    """Return how many pixels further samples are than their place, in an image of this width.
+    """Return the address steps from a peak to its samples, in an image of this width.
 
-    Steps back are unsigned numbers that wrap around, as their sums with the place's address do.
+    Negative steps are unsigned numbers that wrap around when they are added to an address.
     """
     steps: _Addresses = (offsets[1] * width + offsets[0]).view(np.uintp)
     return steps
@@ -192,7 +206,7 @@ def _steps(offsets: IndexArray, width: int) -> _Addresses:
 def _keep_inside(
     offsets: IndexArray, x: int, y: int, width: int, height: int, places: _Addresses
 ) -> None:
-    """Fill in where samples are; those beyond the image's border move to its last pixels."""
+    """Fill in the addresses of samples; those beyond the border are moved to border pixels."""
     columns, rows, out = offsets[0].reshape(-1), offsets[1].reshape(-1), places.reshape(-1)
     for k in range(len(out)):
         column = min(max(x + columns[k], 0), width - 1)
@@ -203,8 +217,8 @@ def _keep_inside(
 def _rough_radius(
     pixels: GreyArray, at: np.uintp, steps: _Addresses, dark: int, bright: int
 ) -> int:
-    """Return the number of the rough radius at which there may be a ring, or -1."""
-    most, best = _ENOUGH_OF_FEW - 1, -1
+    """Return the index of the rough radius that fits a ring best, or -1 if none does."""
+    most, best = _MIN_OF_FEW - 1, -1
     for trial in range(len(_ROUGH)):
         count = _count_directions(pixels, at, steps, trial, _FEW, dark, bright)
         if count > most:
@@ -220,14 +234,14 @@ def _clearest(
     rough: int,
     dark: int,
     bright: int,
-    clear: float,
+    max_spread: float,
     values: GreyArray,
 ) -> tuple[float, int]:
-    """Return how clear the clearest ring of about a radius is, and the number of its radius."""
+    """Return the largest clearness of the radii around a rough one, and that radius's index."""
     best, clearest = 0, 0.0
     for k in range(rough * len(_FINE), (rough + 1) * len(_FINE)):
-        if _count_directions(pixels, at, steps, k, _MANY, dark, bright) >= _ENOUGH_OF_MANY:
-            clearness = _clearness(pixels, at, steps, k, clear, values)
+        if _count_directions(pixels, at, steps, k, _MANY, dark, bright) >= _MIN_OF_MANY:
+            clearness = _clearness(pixels, at, steps, k, max_spread, values)
             if clearness > clearest:
                 clearest, best = clearness, k
     return clearest, best
@@ -245,9 +259,9 @@ def _count_directions(
 ) -> int:
     """Count the directions in which a dark ring is followed by a brighter surround.
 
-    In even light a grey value lies between them in all directions; in shade, each direction has a
-    light of its own. The surround may be seen on the nearer circle alone, if the plate's margin is
-    narrow, or on the farther one alone, if blur brings the ring's edge to the nearer.
+    In even light, one grey value separates them in all directions. In shade, the light differs
+    between directions. The surround is the brighter of two circles: if the plate's margin is narrow
+    only the near circle shows it, and if blur spreads the ring's edge only the far one.
     """
     count = 0
     for k in range(directions):
@@ -255,7 +269,7 @@ def _count_directions(
         near = pixels[at + steps[trial, _NEAR, k]]
         surround = np.int64(max(near, pixels[at + steps[trial, _FAR, k]]))
         in_even_light = (ring < dark) & (surround > bright)
-        in_shade = surround > _BRIGHTER * ring + _MIN_CONTRAST
+        in_shade = surround > _SHADE_RATIO * ring + _MIN_CONTRAST
         count += int(in_even_light | in_shade)
     return count
 
@@ -266,41 +280,42 @@ def _clearness(
     at: np.uintp,
     steps: _Addresses,
     trial: int,
-    clear: float,
+    max_spread: float,
     values: GreyArray,
 ) -> float:
-    """Return the contrast, less the ring's spread; 0 if anything is spread too much."""
+    """Return the contrast minus half of the ring's spread; 0 if a test fails."""
     for k in range(_ALL):
         values[0, k] = pixels[at + steps[trial, _RING, _MANY + k]]
         values[1, k] = pixels[at + steps[trial, _CORE, _MANY + k]]
     ring_dark, ring, ring_bright = _order_statistics(values[0], _RING_RANKS)
     core_dark, core, core_bright = _order_statistics(values[1], _CORE_RANKS)
     contrast, spread = core - ring, ring_bright - ring_dark
-    # Most fail by ring and core alone: the surround is sampled only where they do not.
-    if contrast < _MIN_CONTRAST or spread > clear * contrast:
+    # most fail by ring and core already, so the surround is sampled only afterwards
+    if contrast < _MIN_CONTRAST or spread > max_spread * contrast:
         return 0.0
-    if core_bright - core_dark > _MOST_UNEVEN * contrast:
+    if core_bright - core_dark > _MAX_SHADE_UNEVENNESS * contrast:
         return 0.0
     for k in range(_ALL):
         near = pixels[at + steps[trial, _NEAR, _MANY + k]]
         values[2, k] = max(near, pixels[at + steps[trial, _FAR, _MANY + k]])
     plate_dark, plate, plate_bright = _order_statistics(values[2], _PLATE_RANKS)
     contrast = min(core, plate) - ring
-    if contrast < _MIN_CONTRAST or spread > clear * contrast:
+    if contrast < _MIN_CONTRAST or spread > max_spread * contrast:
         return 0.0
-    uneven = max(core_bright - core_dark, plate_bright - plate_dark, abs(core - plate))
-    if uneven > _MOST_UNEVEN * contrast:
+    unevenness = max(core_bright - core_dark, plate_bright - plate_dark, abs(core - plate))
+    if unevenness > _MAX_SHADE_UNEVENNESS * contrast:
         return 0.0
-    if uneven > _UNEVEN * contrast and not _are_lit_alike(values):
+    if unevenness > _MAX_UNEVENNESS * contrast and not _are_lit_alike(values):
         return 0.0
     return float(max(contrast - 0.5 * spread, 1.0))
 
 
 @compiled
 def _are_lit_alike(values: GreyArray) -> bool:
-    """Return whether core and surround differ by the same in half of the directions, as in shade.
+    """Return whether core and surround differ by nearly the same amount in half of the directions.
 
-    `values` (3, 24) are the samples of ring, core and surround.
+    Shade, which falls on both alike, leaves such differences. `values` (3, 24) are the samples on
+    ring, core and surround.
     """
     differences, depths = np.empty(_ALL, np.int16), np.empty(_ALL, np.int16)
     for k in range(_ALL):
@@ -313,7 +328,7 @@ def _are_lit_alike(values: GreyArray) -> bool:
         for j in range(_ALL):
             smaller += np.uint8(depths[j] < depths[k])
         depth = max(depth, depths[k] if smaller <= 2 * _ALL // 3 else np.int16(0))
-    apart = np.int16(math.ceil(1 + _MOST_APART * depth))  # 1: rounding
+    apart = np.int16(math.ceil(1 + _MAX_DIFFERENCE_SPREAD * depth))  # 1: rounding
     for k in range(_ALL):
         alike = np.uint8(0)
         for j in range(_ALL):
@@ -328,10 +343,10 @@ def _are_lit_alike(values: GreyArray) -> bool:
 def _order_statistics(
     values: GreyArray, ranks: tuple[int, int, int]
 ) -> tuple[np.int64, np.int64, np.int64]:
-    """Return the values of three ascending ranks, from 0, without sorting.
+    """Return the values of three ascending ranks, counted from 0, without sorting.
 
-    The value of rank r is the largest that at most r others are less than. 24 comparisons fit into
-    one vector of bytes, so that all are faster than a sort.
+    The value of rank r is the largest one that has at most r smaller ones. 24 comparisons fit into
+    one vector of bytes, so comparing all pairs is faster than sorting.
     """
     low, middle, high = np.uint8(0), np.uint8(0), np.uint8(0)
     for i in range(_ALL):

@@ -1,18 +1,18 @@
-"""Box filters that respond to rings: the first test of every pixel, which must be cheap.
+"""The ring filter: box filters that respond to small rings, the first and cheapest test.
 
-A small ring is a bright core in a dark disc in a bright surround. From the means over 3 x 3, 5 x 5
-and 7 x 7 pixels (the last weighted less towards its corners, as the mean of nine 5 x 5 means) the
-score is
+A small ring is a bright core in a dark disc in a bright surround. Core and disc are means over 3 x
+3 and 5 x 5 pixels. The surround is the mean of nine 5 x 5 means, that is of 7 x 7 pixels with less
+weight towards the corners. The score is
 
     core − disc + surround − disc
 
-which is large where a disc is darker than both its core and its surround, and 0 on planes and in
-the middle of edges. docs/method.md, "Ring filter", has its answer by radius. Larger rings are found
+It is large where a disc is darker than both its core and its surround, and 0 on planes and in the
+middle of edges. docs/method.md, "Ring filter", lists the response by radius. Larger rings are found
 in reduced images.
 
-Speed decides the form: the filters go through an image row by row, in strips. Every loop is over
-one row of small integers, of which the processor takes some tens at once, and all that is kept
-between two loops stays in its cache.
+The code is written for speed: the filters pass through an image row by row, in strips. Every loop
+is over one row of small integers, which is vectorised, and all intermediate results stay in the
+processor's cache.
 """
 
 from __future__ import annotations
@@ -23,51 +23,52 @@ import numpy.typing as npt
 from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 
-# Tuning of the filter. Its benchmarks are `benchmarks.search.hard_frames`, for what is found
-# (values in docs/method.md, "Constants of the search"), and `benchmarks.speed.relative_costs`, for
-# what more peaks cost the stages that follow.
+# Tuning of the filter. It has two benchmarks: `benchmarks.search.hard_frames` for the targets found
+# (results in docs/method.md, "Constants of the search"), and `benchmarks.speed.relative_costs` for
+# the time that more peaks take in later stages.
 PEAK_RADIUS_PX = 2.8
-"""Radius that a peak stands for; the check tries rings from 0.76 to 1.21 of it."""
-_UNIT = 225.0 / 4.0  # of scores, per grey value: 3 · 3 · 5 · 5 pixels, and 16 bits hold the quarter
-_MIN_SCORE = np.int16(5.0 * _UNIT)  # grey values; a ring's is half of its contrast, or less
-_MIN_SHARE = np.int16(0.2 * _UNIT)  # of the range of grey values around: less is texture
-_MAX_PEAK_SHARE, _MAX_PEAKS = 1 / 400, 1000  # of the pixels; in small images
+"""Ring radius that a peak stands for; the check tries 0.76 to 1.21 times this radius."""
+_UNIT = 225.0 / 4.0  # score per grey value: 225 pixels; only a quarter of it fits into 16 bits
+_MIN_SCORE = np.int16(5.0 * _UNIT)  # 5 grey values; a ring's score is at most half of its contrast
+_MIN_SHARE = np.int16(0.2 * _UNIT)  # relative to the range of grey values around; less is texture
+# Largest number of peaks in an image: so many per pixel, but 1000 in small images.
+_MAX_PEAK_SHARE, _MAX_PEAKS = 1 / 400, 1000
 
-_REACH = 4  # rows and columns around a pixel that decide about it, neighbours' filters included
-_STRIP = 1024 - 2 * _REACH  # columns
-_VECTOR = 32  # columns that the processor may take at once
-_ROWS = 8  # rows of grey values that are kept, of which the filters look at seven
-_KEPT = 3  # rows of their answers that are kept
+_REACH = 4  # rows and columns around a pixel on which a peak there depends
+_STRIP = 1024 - 2 * _REACH  # columns of a strip
+_VECTOR = 32  # columns are padded to multiples of this
+_ROWS = 8  # rows of grey values that are kept; the filters use seven
+_KEPT = 3  # rows of filter results that are kept
 
 _Rows = npt.NDArray[np.generic]
 
 
 @compiled
 def find_peaks(reduced: GreyArray, levels: IndexArray) -> tuple[FloatArray, IndexArray]:
-    """Return where the filters answer clearly, image by image.
+    """Return the peaks of the filter's score, image by image.
 
-    The score must be a maximum among its eight neighbours, of some grey values, and at least a
-    fifth of the range of grey values in 5 x 5 pixels. If there are very many such places, those
-    with the largest share of the range are kept.
+    A peak is larger than its eight neighbours, at least 5 grey values, and at least a fifth of the
+    range of grey values in 5 x 5 pixels. If there are too many peaks, those with the largest share
+    of the range are kept.
 
     Parameters
     ----------
     reduced : (n,) array of uint8
-        Images one behind the other.
+        Images one after the other.
     levels : (m, 4) array of int
-        Of each of them: begin and end in `reduced`, height, width.
+        Start and end in `reduced`, height and width of each image.
 
     Returns
     -------
     peaks : (n, 4) array
-        Column and row in the image [px], interpolated; the grey value between those of core and
-        ring; the score's share of the range of grey values.
+        Column and row in the image, interpolated [px]; the mean of core and disc, a grey value
+        between those of core and ring; the score relative to the range of grey values.
     ends : (m,) array of int
-        Where the peaks of each image end.
+        Where the peaks of each image end in `peaks`.
     """
     most, kept = 0, 0
     for i in range(len(levels)):
-        # Maxima have no neighbours.
+        # maxima are never adjacent
         at_most = ((levels[i, 2] + 1) // 2) * ((levels[i, 3] + 1) // 2)
         most, kept = max(most, at_most), kept + min(at_most, _limit(levels[i]))
     peaks, ends = np.empty((kept + most, 4)), np.empty(len(levels), np.intp)
@@ -79,7 +80,7 @@ def find_peaks(reduced: GreyArray, levels: IndexArray) -> tuple[FloatArray, Inde
             end += _scan(image, first, share, peaks[end:])
             if end - count > _limit(at):
                 end = count + _keep_best(peaks[count:end], _limit(at))
-                share = np.int16(peaks[count:end, 3].min())  # lower ones would be dropped
+                share = np.int16(peaks[count:end, 3].min())  # lower ones would be dropped anyway
         count = end
         ends[i] = count
     return peaks[:count], ends
@@ -87,15 +88,15 @@ def find_peaks(reduced: GreyArray, levels: IndexArray) -> tuple[FloatArray, Inde
 
 @compiled
 def _limit(level: IndexArray) -> int:
-    """Return how many peaks of an image are kept."""
+    """Return the largest number of peaks of an image."""
     return max(int(_MAX_PEAK_SHARE * (level[1] - level[0])), _MAX_PEAKS)
 
 
 @compiled
 def _keep_best(peaks: FloatArray, limit: int) -> int:
-    """Move the `limit` peaks with the largest shares to the front; return their number.
+    """Move the `limit` peaks with the largest shares to the front, and return their number.
 
-    If several peaks have the smallest share that is kept, the first of them stay.
+    Of peaks with equal shares at the limit, the first ones are kept.
     """
     least = np.partition(peaks[:, 3].copy(), len(peaks) - limit)[len(peaks) - limit]
     count, alike = 0, limit - np.sum(peaks[:, 3] > least)
@@ -109,14 +110,14 @@ def _keep_best(peaks: FloatArray, limit: int) -> int:
 
 @compiled
 def _scan(image: GreyArray, first: int, share: np.int16, peaks: FloatArray) -> int:
-    """Fill in columns and rows of peaks, grey values between core and ring, shares; count them.
+    """Fill in the peaks of a strip with at least some share, and return their number.
 
-    A strip is scanned from the first column on, for peaks of at least some share. Every filter
-    needs the columns to its right that it has not seen yet, so that entry 0 of a row is left of the
-    strip's first column: by 4 columns in `grey` and `sums`, by 3 in `core`, by 2 in `disc`, `wide`
-    and `extent`, by 1 in `score`. The same holds for rows: with row r of grey values + 2 at hand,
-    sums and discs are those of row r, scores of r − 1 and maxima of r − 2. Rows are kept at their
-    numbers modulo 8 (`grey`) or 3.
+    Columns: entry 0 of a row lies to the left of the strip's first column: by 4 columns in `grey`
+    and `sums`, by 3 in `core`, by 2 in `disc`, `wide` and `extent`, by 1 in `score`.
+
+    Rows: when row r + 2 of the grey values has been read, sums and discs are computed for row r,
+    scores for r − 1 and maxima for r − 2. Rows are stored at their numbers modulo 8 (`grey`) or
+    modulo 3.
     """
     count = 0
     columns = min(image.shape[1] - first, _STRIP)
@@ -150,7 +151,7 @@ def _scan(image: GreyArray, first: int, share: np.int16, peaks: FloatArray) -> i
 
 @inlined
 def _copy_row(image: GreyArray, row: int, first: int, grey: _Rows) -> None:
-    """Copy a row from some column on; beyond its border the image repeats its last pixels."""
+    """Copy a row from a column on; border pixels are repeated beyond the image."""
     height, width = image.shape
     line, out = image[min(max(row, 0), height - 1)], grey[row % _ROWS]
     left, right = max(-first, 0), min(len(out), width - first)
@@ -163,7 +164,7 @@ def _copy_row(image: GreyArray, row: int, first: int, grey: _Rows) -> None:
 
 @inlined
 def _sum_columns(grey: _Rows, row: int, sums: _Rows, width: int) -> None:
-    """Add up three rows and five."""
+    """Fill in column sums over three rows and over five rows."""
     a, b, c = (row - 2) % _ROWS, (row - 1) % _ROWS, row % _ROWS
     d, e = (row + 1) % _ROWS, (row + 2) % _ROWS
     for x in range(width):
@@ -174,7 +175,7 @@ def _sum_columns(grey: _Rows, row: int, sums: _Rows, width: int) -> None:
 
 @inlined
 def _sum_rows(sums: _Rows, slot: int, core: _Rows, disc: _Rows, width: int) -> None:
-    """Add up three columns of the sums of three rows, five of those of five."""
+    """Fill in sums over 3 × 3 pixels (`core`) and over 5 × 5 pixels (`disc`)."""
     for x in range(width):
         core[slot, x] = sums[0, x] + sums[0, x + 1] + sums[0, x + 2]
     for x in range(width):
@@ -184,10 +185,10 @@ def _sum_rows(sums: _Rows, slot: int, core: _Rows, disc: _Rows, width: int) -> N
 
 @inlined
 def _score(core: _Rows, disc: _Rows, slot: int, wide: _Rows, score: _Rows, width: int) -> None:
-    """Combine sums over 9, 25 and 225 pixels, so that nothing exceeds 16 bits.
+    """Fill in scores from sums over 9, 25 and 225 pixels, in 16 bits.
 
-    The common denominator is 225, of which 16 bits without sign just hold 255 times; a quarter of
-    that leaves room for the differences, and for signs.
+    The common denominator is 225. 225 · 255 just fits into 16 bits without sign. A quarter of it
+    leaves room for signs and differences.
     """
     for x in range(width):
         wide[0, x] = disc[0, x] + disc[1, x] + disc[2, x]
@@ -200,7 +201,7 @@ def _score(core: _Rows, disc: _Rows, slot: int, wide: _Rows, score: _Rows, width
 
 @inlined
 def _extents(grey: _Rows, row: int, out: _Rows, width: int) -> None:
-    """Fill in the range of grey values in 5 x 5 pixels in row 0; rows 1 and 2 are for its use."""
+    """Fill in the range of grey values in 5 x 5 pixels, in row 0 of `out`; rows 1, 2 are used."""
     a, b, c = (row - 2) % _ROWS, (row - 1) % _ROWS, row % _ROWS
     d, e = (row + 1) % _ROWS, (row + 2) % _ROWS
     high, low = 1, 2
@@ -216,9 +217,9 @@ def _extents(grey: _Rows, row: int, out: _Rows, width: int) -> None:
 
 @inlined
 def _mark(score: _Rows, row: int, extent: _Rows, share: np.int16, is_peak: _Rows) -> None:
-    """Mark where peaks may be: pixels above four neighbours; of equal ones the first.
+    """Mark pixels larger than their four direct neighbours; of equal ones the first.
 
-    The four others wait for `_describe`: few pixels come so far.
+    `_describe` tests the diagonal neighbours, since few pixels are left by then.
     """
     before, at, after = (row + 2) % _KEPT, row % _KEPT, (row + 1) % _KEPT
     for x in range(len(is_peak)):
@@ -235,10 +236,11 @@ def _mark(score: _Rows, row: int, extent: _Rows, share: np.int16, is_peak: _Rows
 
 @inlined
 def _list_marked(words: _Rows, is_peak: _Rows, columns: int, places: IndexArray) -> int:
-    """Fill in where the peaks of a row are, of which eight are one word; return how many.
+    """Fill in the columns of marked pixels in a row, and return their number.
 
-    Nearly all words are 0. Within one that is not, every place is written and the next one
-    overwrites it unless it was a peak: no branch that the processor may guess wrong.
+    Eight marks are tested at once, as one 64-bit word, because nearly all words are 0. Within other
+    words, every column is written, and is overwritten by the next one unless it is marked. This
+    avoids branches that the processor may mispredict.
     """
     count = 0
     for word in range(-(-columns // 8)):
@@ -260,9 +262,9 @@ def _describe(
     extent: _Rows,
     peaks: FloatArray,
 ) -> int:
-    """Fill in column and row of a row's peaks, grey values between core and ring, and shares.
+    """Fill in the peaks of a row as `find_peaks` returns them, and return their number.
 
-    Count those that are also above their other four neighbours.
+    Marked pixels that are not larger than their diagonal neighbours are left out.
     """
     before, at, after = (row + 2) % _KEPT, row % _KEPT, (row + 1) % _KEPT
     count = 0
@@ -282,5 +284,5 @@ def _describe(
 
 @compiled
 def _parabola_offset(before: int, top: int, after: int) -> float:
-    """Return how far beside a maximum the parabola through the scores has its own: up to ±0.5."""
+    """Return the offset of the maximum of a parabola through three scores: within ±0.5."""
     return 0.5 * (before - after) / min(before - 2 * top + after, -1)

@@ -1,4 +1,4 @@
-"""Grey values of a frame between its pixels: at points, and on ellipses about rings."""
+"""Interpolated grey values of a frame, at points and on ellipses around rings."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, GreyArray, SingleArray
 from kgcp.geometry.conic import Ellipse
 
-FAINTEST_SLOPE = 0.25  # of an edge, in grey values per pixel: less is rounding
+MIN_EDGE_SLOPE = 0.25  # grey values per pixel; smaller slopes are due to rounding
 
 
 def sample_grey(grey: GreyArray, points: npt.NDArray[np.floating]) -> FloatArray:
-    """Sample a frame bilinearly at points (m, n, 2) [px]; beyond its border it repeats itself."""
+    """Sample a frame bilinearly at points (m, n, 2) [px]; border pixels are repeated outside."""
     maps = points.astype(np.float32, copy=False)
-    values = cv2.remap(  # type: ignore[call-overload]  # stubs know no map of both x and y
+    values = cv2.remap(  # type: ignore[call-overload]  # the stubs lack maps of both x and y
         grey, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
     return np.asarray(values, dtype=np.float64)
@@ -28,9 +28,9 @@ def sample_grey(grey: GreyArray, points: npt.NDArray[np.floating]) -> FloatArray
 def sample_ellipses(
     grey: GreyArray, outlines: Sequence[Ellipse], factors: FloatArray, circle: FloatArray
 ) -> FloatArray:
-    """Sample a frame on n outlines enlarged by factors (m,), as `sample_grey`: (n, m, k).
+    """Sample a frame as `sample_grey`, on n outlines that are scaled by factors (m,): (n, m, k).
 
-    `circle` (k, 2) has the points of the unit circle that become those of the ellipses.
+    `circle` (k, 2) are the points of the unit circle that are mapped to the ellipses.
     """
     shape = len(outlines), len(factors), len(circle)
     if not outlines:
@@ -61,7 +61,7 @@ def _place_points(
     circle: FloatArray,
     points: SingleArray,
 ) -> None:
-    """Fill in points (m, k, 2) on ellipses about one centre."""
+    """Fill in points (m, k, 2) on an ellipse that is scaled by factors (m,) about its centre."""
     cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
     for m in range(len(factors)):
         xx = factors[m] * (a * cosine * cosine + b * sine * sine)

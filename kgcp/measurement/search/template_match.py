@@ -1,4 +1,4 @@
-"""Comparison of a ring in a frame with a target's, whole or in part."""
+"""Comparison of a ring in a frame, whole or partly hidden, with the templates of a target."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.search.code_signal import CodeMatch
-from kgcp.measurement.search.correlation import Bank, bank_of, correlate
+from kgcp.measurement.search.correlation import TemplateBank, build_bank, correlate
 from kgcp.measurement.search.sampling import sample_ellipses, sample_grey
 from kgcp.measurement.search.templates import (
     ANGLES,
+    BLUR_CLIP_PAIRS,
     CIRCLE,
     FREQUENCIES,
-    LOOKS,
     SAMPLED_RADII,
     SHIFTS,
     TEMPLATE_RADII,
@@ -29,84 +29,96 @@ from kgcp.measurement.search.templates import (
     edge_rows,
     templates_of,
 )
-from kgcp.measurement.search.uneven_light import SMALLEST_EVENED_PX, evened_patch
+from kgcp.measurement.search.uneven_light import MIN_CORRECTED_RADIUS_PX, light_corrected_patch
 from kgcp.targets.layout import Ring
 
 # Tuning of the comparison. Its benchmarks are `benchmarks.search.hard_frames`, for what is found
 # (values in docs/method.md, "Constants of the search"), and `benchmarks.search.false_alarms`.
-CODE_LIKE = 0.7
-"""Score above which a ring with dots is a code, if another one."""
-_CLEAR_SCORE = 0.9  # of a whole ring, of which nothing is hidden then
-_WORTH_EVENING = 0.6  # score: rings of something else, most of them, are below
-# A dot too many or too few is a misfit of 1. Noise may look like a dot if dots are faint.
+MIN_SCORE_OF_A_CODE = 0.7
+"""Score above which a ring with dots carries some code, though perhaps another one."""
+_CLEAR_SCORE = 0.9  # of a whole ring; above, no part of it is hidden
+_MIN_SCORE_TO_CORRECT = 0.6  # for a correction of the light; most rings of something else have less
+# Limit of the misfit. A dot too many or too few is a misfit of 1. The limit is min(0.45, 0.2 + 0.5
+# · contrast of the dots), because noise may look like a dot if the dots are faint.
 _MAX_MISFIT, _MISFIT_FAINT, _MISFIT_BY_DOTS = 0.45, 0.2, 0.5
-_DARKEST_BLACK = -0.3  # of the contrast: sharpening makes small rings darker than black
-# Rings of which something hides a part.
-_TYPICAL = 0.65  # quantile of steps of light that is not hidden, however much else is
-_MIN_STEP = 0.35  # of the typical one
-_SHORTEST = 13  # samples; a dot that is too large takes less
+_MIN_BLACK = -0.3  # relative to the contrast; sharpening makes small rings darker than black
+# Constants for rings that are partly hidden.
+# Quantile of the steps at an edge that is typical of its visible part, however much is hidden.
+_TYPICAL = 0.65
+_MIN_STEP = 0.35  # of a visible edge, relative to the typical one
+_MIN_RUN = 13  # samples of a hidden part; a dot that is too large takes fewer
 _BORDER = 2  # samples beside a hidden part that blur may mix with it
-_MOST_HIDDEN = 0.4
-_DOTS_SEEN = 0.5  # of the code; the absence of others in the visible part counts as much
-_OTHER_LAG = 6  # samples; a match farther off is another heading
-_MARGIN = 0.04  # of the score, to other headings
-_LIKE_CODE = 0.6  # along the code circle; 0.77 and more for 160 hidden or cut targets
+_MAX_HIDDEN = 0.4  # share of the angles
+# Share of the code's dots that must be visible. That the visible part has no other dots is as
+# informative.
+_MIN_VISIBLE_DOTS = 0.5
+_OTHER_LAG = 6  # samples; matches that are farther off belong to another heading
+_MARGIN = 0.04  # by which the best score must exceed those of other headings
+# Score along the visible part of the code circle, at any heading. 160 hidden or cut targets had
+# 0.77 or more.
+_MIN_CODE_CIRCLE_SCORE = 0.6
 
 _TYPICAL_RANK = round(_TYPICAL * (ANGLES - 1))
-_LOOK_OF_CODE = LOOKS.index((0.07, 1.0))
+_CODE_TEMPLATE = BLUR_CLIP_PAIRS.index((0.07, 1.0))  # the template whose code circle is compared
 _EVERYWHERE = np.ones(ANGLES, dtype=bool)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TemplateMatch:
-    """Agreement of one ring in the frame with a target's."""
+    """Agreement of one ring in the frame with the ring of a target."""
 
-    score: float  # normalised cross-correlation with the best template, of the visible part, -1…1
-    lag_deg: float  # heading of the plate's +x axis, as an angle of the sampled circles [deg]
+    score: float  # normalised cross-correlation of the visible part with the best template, -1…1
+    lag_deg: float  # direction of the plate's +x axis, as an angle of the sampled circles [deg]
     # levels of ink and plate [grey values]
     black: float
     white: float
-    # largest difference to the template along the code, of a dot's contrast: 1 is a dot too many or
-    # too few
+    # largest difference from the template along the code circle, relative to a dot's contrast: 1
+    # for a dot too many or too few
     misfit: float
-    # of the template's dots, of the ring's contrast: less than 1 where they are blurred
+    # contrast of the template's dots, relative to the ring's: less than 1 if they are blurred
     dot_contrast: float
-    # (angles,): where the ring is seen, by angles of the sampled circles; None: everywhere
+    # (angles,): whether the ring is visible at each angle of the sampled circles; None if it is
+    # everywhere
     visible: BoolArray | None
 
     @property
     def limit(self) -> float:
-        """Largest `misfit` that is accepted: less where blur leaves little of the dots."""
+        """Largest `misfit` that is accepted: less if blur leaves little of the dots."""
         return min(_MAX_MISFIT, _MISFIT_FAINT + _MISFIT_BY_DOTS * self.dot_contrast)
 
     @property
     def is_clear(self) -> bool:
-        """Whether the whole ring looks like the target's."""
+        """Whether the whole ring agrees with that of the target."""
         return self.score >= _CLEAR_SCORE and self.misfit <= self.limit
 
     def check(self, min_score: float) -> None:
-        """Raise `Rejection` unless this is the target's ring."""
+        """Raise `Rejection` unless this is the ring of the target."""
         contrast = self.white - self.black
-        if self.score < min(CODE_LIKE, min_score):
+        if self.score < min(MIN_SCORE_OF_A_CODE, min_score):
             reason = Reason.CODE_MISMATCH
         elif self.misfit > self.limit:
             reason = Reason.OTHER_CODE
         elif self.score < min_score:
             reason = Reason.CODE_MISMATCH
-        elif contrast <= 0.0 or self.black < _DARKEST_BLACK * contrast:
-            raise Rejection(Reason.NO_CONTRAST, f"levels {self.black:.0f} and {self.white:.0f}")
+        elif contrast <= 0.0 or self.black < _MIN_BLACK * contrast:
+            raise Rejection(
+                Reason.NO_CONTRAST,
+                f"levels of ink and plate: {self.black:.0f} and {self.white:.0f}",
+            )
         else:
             return
-        numbers = f"score {self.score:.2f}, a dot off by {self.misfit:.2f} of {self.limit:.2f}"
+        numbers = (
+            f"score {self.score:.2f}, a dot is off by {self.misfit:.2f}, limit {self.limit:.2f}"
+        )
         raise Rejection(reason, numbers)
 
     def code_match(self, ring: Ring, outline: Ellipse) -> CodeMatch:
-        """Return the ring of this outline as one that carries the code."""
+        """Return the match of a ring with this outline."""
         return CodeMatch(ring, outline, self.score, self.lag_deg, self.black, self.white)
 
 
 class TemplatePlacement(NamedTuple):
-    """The template that fits best, and where: shift in rows, lag in samples."""
+    """The template with the best score, its radial shift in rows and its lag in samples."""
 
     score: float
     template: int
@@ -115,24 +127,24 @@ class TemplatePlacement(NamedTuple):
 
 
 def match_templates_at(grey: GreyArray, camera: Camera, pose: Pose, ring: Ring) -> TemplateMatch:
-    """Compare a ring with its templates as a pose puts them; angles are the plate's."""
+    """Compare a ring with its templates at a predicted pose; angles are those on the plate."""
     radii_m = 0.5 * ring.outer_diameter_m * SAMPLED_RADII
     points = camera.project_circles(pose.rotation, pose.translation_m, radii_m, CIRCLE)
     return match_templates(sample_grey(grey, points), ring, _radius_px(camera, pose, ring))
 
 
-def code_in_even_light(
+def light_corrected_code(
     grey: GreyArray, camera: Camera, pose: Pose, ring: Ring
 ) -> FloatArray | None:
-    """Return what a pose shows along the code circle (360,), as it would be in even light.
+    """Return the grey values along the code circle (360,) of a pose, corrected for uneven light.
 
-    None where the light is even, where a part is not a ring, and of a small ring.
+    None if the light is even, if a part does not look like a ring, or if the ring is small.
     """
-    if _radius_px(camera, pose, ring) < SMALLEST_EVENED_PX:
+    if _radius_px(camera, pose, ring) < MIN_CORRECTED_RADIUS_PX:
         return None
     radii_m = 0.5 * ring.outer_diameter_m * SAMPLED_RADII
     points = camera.project_circles(pose.rotation, pose.translation_m, radii_m, CIRCLE)
-    even = evened_patch(sample_grey(grey, points), ring, SHIFTS)
+    even = light_corrected_patch(sample_grey(grey, points), ring, SHIFTS)
     if even is None:
         return None
     row = int(np.abs(SAMPLED_RADII * ring.outer_diameter_m - ring.code_diameter_m).argmin())
@@ -145,23 +157,23 @@ def _radius_px(camera: Camera, pose: Pose, ring: Ring) -> float:
 
 
 def polar_patch(grey: GreyArray, outline: Ellipse) -> FloatArray:
-    """Sample a frame around an outline, for `match_templates`: (radii, angles)."""
+    """Return the polar samples (radii, angles) around an outline that `match_templates` takes."""
     return np.asarray(sample_ellipses(grey, (outline,), SAMPLED_RADII, CIRCLE)[0])
 
 
 def match_templates(patch: FloatArray, ring: Ring, radius_px: float) -> TemplateMatch:
     """Compare a polar patch (radii, angles) of the frame with the ring's templates.
 
-    In uneven light a ring of some size is compared as it would be in even light; where a part of
-    the ring is hidden, the rest of it is compared.
+    In uneven light, rings that are not too small are compared after a correction of the light. If a
+    part of the ring is hidden, the rest is compared.
     """
     templates = templates_of(ring)
     whole = best_placement(correlate(patch, templates))
     template_match = _matched(patch, ring, whole, None)
     if template_match.is_clear:
         return template_match
-    if template_match.score > _WORTH_EVENING and radius_px >= SMALLEST_EVENED_PX:
-        even = evened_patch(patch, ring, whole.shift)
+    if template_match.score > _MIN_SCORE_TO_CORRECT and radius_px >= MIN_CORRECTED_RADIUS_PX:
+        even = light_corrected_patch(patch, ring, whole.shift)
         if even is not None:
             in_even_light = _matched(even, ring, best_placement(correlate(even, templates)), None)
             if in_even_light.is_clear:
@@ -177,7 +189,7 @@ def match_templates(patch: FloatArray, ring: Ring, radius_px: float) -> Template
 
 
 def best_placement(scores: SingleArray) -> TemplatePlacement:
-    """Return the largest of the scores (templates, shifts, lags), and where it is."""
+    """Return the largest of the scores (templates, shifts, lags) with its indices."""
     place, lag = divmod(int(scores.argmax()), scores.shape[2])
     template, shift = divmod(place, scores.shape[1])
     return TemplatePlacement(float(scores[template, shift, lag]), template, shift, lag)
@@ -221,10 +233,11 @@ def _compare(
     last: int,
     half: int,
 ) -> tuple[float, float, float, float]:
-    """Fit black and contrast to the visible part of a ring, by an image (rows, angles) of it.
+    """Fit black and contrast of a template `image` (rows, angles) to the visible part of a patch.
 
-    Also returned, of the means over the code's rows, `first` to `last`, smoothed over `half` a dot
-    either side: the range in the image, and the largest difference between image and patch.
+    Returned are black, contrast, and two properties of the signal along the code: the range of the
+    template's signal, and the largest difference between template and patch. The signal is the mean
+    over the rows `first` to `last`, smoothed over `half` samples, half a dot, on either side.
     """
     total = image_mean = image_square = patch_mean = product = 0.0
     rows, angles = image.shape
@@ -260,33 +273,33 @@ def _compare(
 
 
 def visible_angles(patch: FloatArray, ring: Ring) -> BoolArray | None:
-    """Return at which angles (angles,) a ring shows both of its edges.
+    """Return at which angles (angles,) both edges of a ring are visible.
 
     None if nothing is hidden, or too much. The patch (rows, angles) is sampled at `TEMPLATE_RADII`.
     """
     plate, outside, disc, inside = edge_rows(ring)
     visible = np.empty(ANGLES, dtype=bool)
     hidden = _mark_visible(patch[plate] - patch[outside], patch[disc] - patch[inside], visible)
-    return visible if 0 < hidden <= _MOST_HIDDEN * ANGLES else None
+    return visible if 0 < hidden <= _MAX_HIDDEN * ANGLES else None
 
 
 @compiled
 def _mark_visible(outwards: FloatArray, inwards: FloatArray, visible: BoolArray) -> int:
-    """Fill in where the light rises at both edges, `outwards` and `inwards`; count the others.
+    """Fill in where the steps at both edges, `outwards` and `inwards`, are large; count the others.
 
-    Runs of missing edges shorter than `_SHORTEST` are noise or dots and count as visible.
+    Runs of missing edges that are shorter than `_MIN_RUN` are noise or dots, and count as visible.
     """
     least_outwards = _MIN_STEP * np.partition(outwards, _TYPICAL_RANK)[_TYPICAL_RANK]
     least_inwards = _MIN_STEP * np.partition(inwards, _TYPICAL_RANK)[_TYPICAL_RANK]
     for a in range(ANGLES):
         visible[a] = outwards[a] > least_outwards and inwards[a] > least_inwards
-    is_middle = np.zeros(ANGLES, np.bool_)  # of `_SHORTEST` angles that are all hidden
+    is_middle = np.zeros(ANGLES, np.bool_)  # of `_MIN_RUN` angles that are all hidden
     length = 0
-    for step in range(ANGLES + _SHORTEST - 1):  # past the end: runs may go over it
+    for step in range(ANGLES + _MIN_RUN - 1):  # beyond the end, because runs may wrap around
         length = 0 if visible[step % ANGLES] else length + 1
-        if length >= _SHORTEST:
-            is_middle[(step - _SHORTEST // 2) % ANGLES] = True
-    reach = _SHORTEST // 2 + _BORDER
+        if length >= _MIN_RUN:
+            is_middle[(step - _MIN_RUN // 2) % ANGLES] = True
+    reach = _MIN_RUN // 2 + _BORDER
     visible[:] = True
     for a in range(ANGLES):
         if is_middle[a]:
@@ -298,35 +311,38 @@ def _mark_visible(outwards: FloatArray, inwards: FloatArray, visible: BoolArray)
 def may_show_code(patch: FloatArray, visible: BoolArray, ring: Ring, shift: int) -> bool:
     """Return whether the visible part of the code circle resembles the code at any heading.
 
-    Most rings of something else do not, and need no comparison with all templates.
+    Most other rings do not, which saves the comparison with all templates.
 
     Parameters
     ----------
     patch : (rows + 2 shifts, angles) array
         Sampled at `SAMPLED_RADII`.
     visible : (angles,) array of bool
+        Which angles are compared.
     shift : int
-        Of the template that fits the whole ring best.
+        Radial shift of the template that fits the whole ring best.
     """
     first, last = code_rows(ring)
     along_code = patch[shift + first : shift + last + 1].sum(axis=0)
-    return bool(correlate(along_code[None], _code_circle(ring), visible).max() > _LIKE_CODE)
+    return bool(
+        correlate(along_code[None], _code_circle(ring), visible).max() > _MIN_CODE_CIRCLE_SCORE
+    )
 
 
 @lru_cache(maxsize=64)
-def _code_circle(ring: Ring) -> Bank:
-    """Return what a blurred ring shows along its code circle, as a template of one row."""
+def _code_circle(ring: Ring) -> TemplateBank:
+    """Return the code circle of a blurred ring as a template of one row."""
     first, last = code_rows(ring)
-    along_code = templates_of(ring).images[_LOOK_OF_CODE, first : last + 1].sum(axis=0)
-    return bank_of(along_code[None, None], np.ones(1), FREQUENCIES)
+    along_code = templates_of(ring).images[_CODE_TEMPLATE, first : last + 1].sum(axis=0)
+    return build_bank(along_code[None, None], np.ones(1), FREQUENCIES)
 
 
 def _tells_heading(
     scores: SingleArray, best: TemplatePlacement, visible: BoolArray, ring: Ring
 ) -> bool:
-    """Return whether enough dots are visible, and whether they leave only one heading."""
+    """Return whether enough dots are visible, and no other heading scores nearly as high."""
     lags = np.arange(best.lag + _OTHER_LAG, best.lag + ANGLES - _OTHER_LAG + 1)
     elsewhere = scores.max(axis=(0, 1)).take(lags, mode="wrap").max()
     dots = [round(deg * ANGLES / 360.0) + best.lag for deg in ring.code_deg]
     visible_dots = int(visible.take(dots, mode="wrap").sum())
-    return visible_dots >= _DOTS_SEEN * len(dots) and elsewhere <= best.score - _MARGIN
+    return visible_dots >= _MIN_VISIBLE_DOTS * len(dots) and elsewhere <= best.score - _MARGIN

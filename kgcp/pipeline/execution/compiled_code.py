@@ -18,7 +18,7 @@ from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.fit_target import measure_by_model
 from kgcp.measurement.frame import examine
 from kgcp.measurement.records import InitialPose
-from kgcp.measurement.search.candidates import find_code, find_dotted, find_rings
+from kgcp.measurement.search.candidates import find_code, find_dotted_rings, find_rings
 from kgcp.measurement.search.initial_pose import initial_pose
 from kgcp.measurement.search.template_match import match_templates_at
 from kgcp.pipeline.execution.local_processes import Preparation
@@ -48,7 +48,7 @@ def load_compiled_code() -> bool:
         return True
     from numba.core import event
 
-    class Refusal(event.Listener):
+    class RefusedCandidate(event.Listener):
         """Hears of functions that would be compiled."""
 
         def on_start(self, event: object) -> None:  # noqa: ARG002 - the base class's signature
@@ -59,7 +59,7 @@ def load_compiled_code() -> bool:
             """Hear that it is compiled."""
 
     try:
-        with event.install_listener("numba:compile", Refusal()):
+        with event.install_listener("numba:compile", RefusedCandidate()):
             compile_code()
     except _NotCompiled:
         return False
@@ -70,7 +70,7 @@ def load_compiled_code() -> bool:
 def compile_search() -> None:
     """Compile what is missing of the search: by looking for the drawn plate."""
     grey, target = _drawn_plate(), Target(_RING)
-    candidates = find_dotted(grey, find_rings(grey, DetectSettings()), [_RING])
+    candidates = find_dotted_rings(grey, find_rings(grey, DetectSettings()), [_RING])
     (match,), _ = find_code(candidates[_RING], _RING, DetectSettings())
     start = initial_pose(grey, _CAMERA, target, match)
     match_templates_at(grey, _CAMERA, start.pose, _RING)

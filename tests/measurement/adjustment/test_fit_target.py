@@ -22,7 +22,7 @@ from kgcp.measurement.adjustment.two_poses import TwoPoses
 from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.plate_prior import PlatePrior
 from kgcp.measurement.records import InitialPose, Measurement, ToneBase
-from kgcp.measurement.search.candidates import find_code, find_dotted, find_rings
+from kgcp.measurement.search.candidates import find_code, find_dotted_rings, find_rings
 from kgcp.measurement.search.initial_pose import initial_pose
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import DECOY_PLATE, TARGET_PLATE
@@ -342,7 +342,7 @@ def test_the_start_from_a_replica_is_good_to_two_per_cent(
     pose = place_plate((240.0, 180.0), radius_px / 0.2, tilt_deg=10.0)
     light = {"black": 0.06 * gain, "white": 0.75 * gain, "ground": 0.3 * gain}
     frame = draw_frame((target, pose), blur_px=1.1, **light)
-    candidates = find_dotted(frame, find_rings(frame, settings), [replica])[replica]
+    candidates = find_dotted_rings(frame, find_rings(frame, settings), [replica])[replica]
     matches, _ = find_code(candidates, replica, settings)
     starts: list[Pose] = []
 

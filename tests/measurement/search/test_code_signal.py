@@ -11,7 +11,7 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.search.candidates import find_code, find_dotted, find_rings
+from kgcp.measurement.search.candidates import find_code, find_dotted_rings, find_rings
 from kgcp.measurement.search.code_signal import (
     CODE_ANGLES_RAD,
     fixed_lag_score,
@@ -94,7 +94,7 @@ def test_a_similar_code_of_the_same_geometry_is_another_target(
     for plate, expected in ((target, 1), (other, 0)):
         pose = place_plate((250.0, 170.0), radius_px, turn_deg=100.0)
         frame = draw_frame((plate, pose))
-        candidates = find_dotted(frame, (outer,), [ring])
+        candidates = find_dotted_rings(frame, (outer,), [ring])
         matches, refused = find_code(candidates[ring], ring, DetectSettings())
         assert len(matches) == expected
         assert [refusal.reason for refusal in refused] == [Reason.OTHER_CODE][expected:]
@@ -110,7 +110,10 @@ def test_a_code_without_a_ring_around_it_is_refused(target: Target) -> None:
         frame[np.hypot(columns - x, rows - y) < 5.7] = 200
     signal = sample_grey(frame, outer.points(CODE_ANGLES_RAD, CODE_RATIO)[None])
     assert match_code(signal, target.ring)[0][0] > 0.95
-    assert find_dotted(frame, (outer,), target.rings) == {target.ring: (), target.replicas[0]: ()}
+    assert find_dotted_rings(frame, (outer,), target.rings) == {
+        target.ring: (),
+        target.replicas[0]: (),
+    }
     patch = np.stack([outer.points(ANGLES_RAD, radius) for radius in SAMPLED_RADII])
     template_match = match_templates(sample_grey(frame, patch), target.ring, 40.0)
     with pytest.raises(Rejection):
@@ -128,7 +131,7 @@ def test_disc_and_plate_that_differ_in_shade_only_are_one_target(
     crossing = np.where(inside, (rows - 170) / 16, (columns - 250) / 44)  # no light does that
     for light, expected in ((shade, 1), (np.clip(0.67 + 0.33 * crossing, 0.0, 1.0), 0)):
         frame = np.rint(plate * light).astype(np.uint8)
-        assert len(find_dotted(frame, (outer,), [target.ring])[target.ring]) == expected
+        assert len(find_dotted_rings(frame, (outer,), [target.ring])[target.ring]) == expected
     found = find_rings(np.rint(plate * shade).astype(np.uint8), DetectSettings())
     assert any(math.dist((ring.x, ring.y, ring.a), (250.0, 170.0, 40.0)) < 2.0 for ring in found)
 

@@ -18,7 +18,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.records import Miss
-from kgcp.measurement.search.dot_reading import describe_dots, read_dots, turned_to
+from kgcp.measurement.search.dot_reading import align_dots, describe_dots, read_dots
 from kgcp.pipeline.measure import measure_frame
 from kgcp.targets.layout import Ring, Target
 
@@ -45,10 +45,10 @@ def whole(code_deg: tuple[float, ...]) -> Target:
 )
 def test_a_code_is_known_at_any_heading(turn_deg: float, noise_deg: list[float]) -> None:
     dots = np.sort((np.array(RING.code_deg) + noise_deg + turn_deg) % 360.0)
-    assert turned_to(dots, RING.code_deg, HALF_DEG).is_code
-    assert not turned_to(dots, MIRRORED, HALF_DEG).is_code
-    assert not turned_to(dots, (0.0, 50.0, 78.0, 180.0), HALF_DEG).is_code
-    assert not turned_to(dots[1:], RING.code_deg, HALF_DEG).is_code
+    assert align_dots(dots, RING.code_deg, HALF_DEG).is_code
+    assert not align_dots(dots, MIRRORED, HALF_DEG).is_code
+    assert not align_dots(dots, (0.0, 50.0, 78.0, 180.0), HALF_DEG).is_code
+    assert not align_dots(dots[1:], RING.code_deg, HALF_DEG).is_code
 
 
 @pytest.mark.parametrize("radius_px", [11.0, 20.0, 60.0])
@@ -73,7 +73,7 @@ def test_a_wrong_code_is_read_from_the_frame(
     read = re.search(r"dots at ([\d, ]+) deg, flight.toml has 0, 43, 78, 180 for A", miss.detail)
     assert read, miss.detail
     dots = np.array([float(angle) for angle in read[1].split(", ")])
-    assert turned_to(dots, code_deg, HALF_DEG).is_code, miss.detail
+    assert align_dots(dots, code_deg, HALF_DEG).is_code, miss.detail
     assert ("these are its mirror image" in miss.detail) == (code_deg is MIRRORED)
 
 

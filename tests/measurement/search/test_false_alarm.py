@@ -14,7 +14,11 @@ from kgcp.errors import Reason, Rejection
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.records import Appearance, Measurement
 from kgcp.measurement.search.code_signal import match_code
-from kgcp.measurement.search.false_alarm import RINGS_PER_FRAME, check_chance, code_chance
+from kgcp.measurement.search.false_alarm import (
+    CHANCE_RINGS_PER_FRAME,
+    check_false_alarm,
+    false_code_probability,
+)
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.targets.layout import Ring
 
@@ -45,7 +49,7 @@ def test_random_rings_pass_no_more_often_than_stated_and_not_much_less(
     light = np.fft.irfft(np.fft.rfft(rng.normal(size=(FRAMES, 360))) * damping, 360)
     scores = match_code(light, ring)[0]
     for share in (1e-1, 1e-2, 1e-3):
-        stated = code_chance(float(np.quantile(scores, 1.0 - share)), ring, blur_rad)
+        stated = false_code_probability(float(np.quantile(scores, 1.0 - share)), ring, blur_rad)
         assert 0.8 * share < stated < 15.0 * share
 
 
@@ -53,20 +57,22 @@ def test_random_rings_pass_no_more_often_than_stated_and_not_much_less(
 def test_a_higher_score_is_less_likely_and_blur_makes_it_more_so(
     score: float, blur_rad: float
 ) -> None:
-    chance = code_chance(score, MAIN, blur_rad)
-    assert 0.0 <= code_chance(score + 0.01, MAIN, blur_rad) <= chance <= 1.0
+    chance = false_code_probability(score, MAIN, blur_rad)
+    assert 0.0 <= false_code_probability(score + 0.01, MAIN, blur_rad) <= chance <= 1.0
     if score > 0.7:
-        assert chance <= code_chance(score, MAIN, 1.2 * blur_rad)
+        assert chance <= false_code_probability(score, MAIN, 1.2 * blur_rad)
 
 
 def test_the_limit_is_on_the_chance_per_frame() -> None:
-    chance = RINGS_PER_FRAME * code_chance(0.95, MAIN, 0.8 / (12.0 * 0.642857143 / 0.9))
-    check_chance(OBSERVATION, TARGET, MAIN, 1.01 * chance)
-    with pytest.raises(Rejection, match=r"score 0\.95 comes about by chance") as caught:
-        check_chance(OBSERVATION, TARGET, MAIN, 0.99 * chance)
+    chance = CHANCE_RINGS_PER_FRAME * false_code_probability(
+        0.95, MAIN, 0.8 / (12.0 * 0.642857143 / 0.9)
+    )
+    check_false_alarm(OBSERVATION, TARGET, MAIN, 1.01 * chance)
+    with pytest.raises(Rejection, match=r"score 0\.95 occurs by chance") as caught:
+        check_false_alarm(OBSERVATION, TARGET, MAIN, 0.99 * chance)
     assert caught.value.reason is Reason.CODE_MISMATCH
 
 
 def test_without_a_blur_nothing_is_known_of_chance() -> None:
     appearance = replace(OBSERVATION.appearance, blur_px=None)
-    check_chance(replace(OBSERVATION, score=0.1, appearance=appearance), TARGET, MAIN, 1e-12)
+    check_false_alarm(replace(OBSERVATION, score=0.1, appearance=appearance), TARGET, MAIN, 1e-12)

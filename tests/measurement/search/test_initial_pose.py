@@ -13,7 +13,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.records import InitialPose
-from kgcp.measurement.search.candidates import find_code, find_dotted, find_rings
+from kgcp.measurement.search.candidates import find_code, find_dotted_rings, find_rings
 from kgcp.measurement.search.initial_pose import initial_pose
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
@@ -33,7 +33,7 @@ def started(
         single = Target(target.ring)
         grey = draw_frame((single, pose), **light)
         settings = DetectSettings()
-        candidates = find_dotted(grey, find_rings(grey, settings), single.rings)
+        candidates = find_dotted_rings(grey, find_rings(grey, settings), single.rings)
         matches, _ = find_code(candidates[single.ring], single.ring, settings)
         return initial_pose(grey, camera, single, matches[0]), pose
 
@@ -65,7 +65,7 @@ def test_an_outline_from_a_reduced_image_is_mended_in_the_frame(
     grey = draw_frame((single, pose))
     grey[: int(pose_row(camera, pose)) - 40, :205] = 90  # hides a part of the edge
     settings = DetectSettings()
-    candidates = find_dotted(grey, find_rings(grey, settings), single.rings)
+    candidates = find_dotted_rings(grey, find_rings(grey, settings), single.rings)
     matches, _ = find_code(candidates[single.ring], single.ring, settings)
     outer = matches[0].outer
     x, y, a, b = np.add((outer.x, outer.y, outer.a, outer.b), off_px)

@@ -10,7 +10,7 @@ import pytest
 
 from kgcp.geometry.arrays import GreyArray
 from kgcp.measurement.search.outlines import find_seeds, non_max_suppression, track_outlines
-from kgcp.measurement.search.pyramid import build_pyramid, factor_of
+from kgcp.measurement.search.pyramid import build_pyramid, reduction_factor
 
 SUPER = 8  # factor by which the drawing is larger
 BLACK, WHITE = 40.0, 190.0
@@ -44,7 +44,7 @@ def test_reduced_images_show_what_the_frame_shows(
     assert [tuple(size) for size in pyramid.levels[:, 2:]][:5] == sizes
     for i, (begin, end, height, width) in enumerate(pyramid.levels):
         image = pyramid.reduced[begin:end].reshape(height, width)
-        column, row = (factor_of(i) * (np.arange(n) + 0.5) - 0.5 for n in (width, height))
+        column, row = (reduction_factor(i) * (np.arange(n) + 0.5) - 0.5 for n in (width, height))
         assert np.abs(image - (20.0 + 0.9 * column + 1.1 * row[:, None])).max() < 1.5
 
 

@@ -10,7 +10,7 @@ import pytest
 from scipy import ndimage
 
 from kgcp.geometry.arrays import FloatArray, GreyArray
-from kgcp.measurement.search.pyramid import Pyramid, build_pyramid, factor_of
+from kgcp.measurement.search.pyramid import Pyramid, build_pyramid, reduction_factor
 from kgcp.measurement.search.ring_check import check_peaks
 
 BLACK, WHITE = 40, 190
@@ -111,7 +111,7 @@ def frame_of_rings(seed: int, typical_px: float) -> tuple[GreyArray, FloatArray]
 @pytest.mark.parametrize("level", range(6))
 @pytest.mark.parametrize("seed", range(3))
 def test_rings_are_those_of_the_definition(level: int, seed: int) -> None:
-    factor = factor_of(level)
+    factor = reduction_factor(level)
     frame, centres = frame_of_rings(seed, 0.9 * PEAK_RADIUS_PX * factor)
     pyramid = build_pyramid(frame)
     rng = np.random.default_rng(seed)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.measurement.search.correlation import bank_of, correlate
+from kgcp.measurement.search.correlation import build_bank, correlate
 from kgcp.measurement.search.template_match import (
     best_placement,
     match_templates,
@@ -42,7 +42,7 @@ def test_scores_are_those_of_the_definition(shape: tuple[int, ...], hidden: int)
     spectrum = rng.normal(size=(count, rows, 12)) + 1j * rng.normal(size=(count, rows, 12))
     images = np.fft.irfft(spectrum, angles, axis=2)
     row_weights = rng.uniform(0.5, 2.0, rows)
-    bank = bank_of(images, row_weights, 12)
+    bank = build_bank(images, row_weights, 12)
     patch = rng.uniform(0.0, 255.0, (rows + shifts - 1, angles))
     visible = np.roll(np.arange(angles) >= hidden * angles // 100, 7)
     scores = correlate(patch, bank, visible if hidden else None)

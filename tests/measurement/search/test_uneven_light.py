@@ -10,7 +10,7 @@ import pytest
 from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.search.template_match import match_templates
 from kgcp.measurement.search.templates import ANGLES, ANGLES_RAD, SHIFTS, templates_of
-from kgcp.measurement.search.uneven_light import _around, evened_patch
+from kgcp.measurement.search.uneven_light import _smooth_levels, light_corrected_patch
 from kgcp.targets.layout import Ring, Target
 
 TURN = 17
@@ -29,12 +29,14 @@ def half_in_shade() -> FloatArray:
 
 
 def test_even_light_is_left_as_it_is(target: Target) -> None:
-    assert evened_patch(patch_of(target.ring, np.ones(ANGLES)), target.ring, SHIFTS) is None
+    assert (
+        light_corrected_patch(patch_of(target.ring, np.ones(ANGLES)), target.ring, SHIFTS) is None
+    )
 
 
 def test_a_ring_half_in_shade_is_clear(target: Target) -> None:
     patch = patch_of(target.ring, half_in_shade())
-    even = evened_patch(patch, target.ring, SHIFTS)
+    even = light_corrected_patch(patch, target.ring, SHIFTS)
     assert even is not None
     template_match = match_templates(patch, target.ring, 40.0)
     assert template_match.is_clear
@@ -70,4 +72,6 @@ def test_levels_are_those_of_a_rank_among_neighbours_smoothed(rank: int, half: i
         weight * np.roll(ranked, step, axis=1)
         for weight, step in zip(weights, range(-8, 9), strict=True)
     )
-    np.testing.assert_allclose(_around(circles, rank, half), smoothed / weights.sum(), atol=1e-12)
+    np.testing.assert_allclose(
+        _smooth_levels(circles, rank, half), smoothed / weights.sum(), atol=1e-12
+    )
