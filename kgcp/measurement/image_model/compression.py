@@ -1,10 +1,13 @@
-"""What grey values were before JPEG compressed the photograph.
+"""Comparison of a model with grey values that JPEG has compressed.
 
-JPEG rounds the cosine transform of every block of 8 × 8 pixels to multiples of 64 steps. At the
-edge of a disc, most of what tells the tone curve from the blur is below half a step and is gone.
-Taken for noise, that bends the curve. So a coefficient only says that it was within half a step
-of what is left of it (interval censoring): that is what the model is compared with.
-The steps are read from the photograph itself: its coefficients are their multiples.
+JPEG divides a photograph into blocks of 8 × 8 pixels and rounds the 64 coefficients of each block's
+cosine transform to multiples of a quantisation step, one step per frequency. At the edge of a disc,
+most of the signal that separates the tone curve from the blur is smaller than half a step, and is
+lost. If this loss were treated as noise, the estimated curve would be bent.
+
+Therefore a coefficient only says that its value before rounding was within half a step of its
+present one (interval censoring), and the model is compared with these intervals. The steps are
+estimated from the photograph itself, since its coefficients are multiples of them.
 """
 
 from __future__ import annotations
@@ -22,31 +25,39 @@ from kgcp.measurement.image_model.noise import OUTLIER_SIGMAS, Misfit
 
 _Pixel = TypeVar("_Pixel", bound=np.generic)
 
-_SIDE, _WHITE = 8, 255.0  # of a block; of 8 bits
-_MOST_BLOCKS, _FEWEST_BLOCKS = 4000, 30  # the least even ones, to read the steps from, …
-_LEAST_RANGE = 24  # … of so many grey values at least
-_NEAR_PX = 256  # about a place, in every direction: 1000 to 4000 blocks
-_NONE = 1.4  # coefficients up to here may be zero: rounded pixels leave a deviation of 0.29
-_FEWEST_COEFFICIENTS = 20
-_LARGEST_STEP = 255
-# Least mean of cos(2π c / step) over coefficients c, of what rounded pixels leave of it
-_PERIODIC = 0.6
-_LEAST_DETERMINED = 6  # steps of 64, …
-# … and the share of those that enough coefficients could show. JPEG leaves 0.6 or more of them.
-# Where blocks begin elsewhere, since the photograph was cropped or resized, or where nothing was
-# compressed, it is 0.45 at most: coefficients that fade out above `_NONE` look like multiples.
-_LEAST_SHARE = 0.55
-_LEAST_SD_COUNTS = 0.3  # quantisation of grey values alone
-_IMPOSSIBLE = 1e-8  # probability of an interval, below which only its nearer end counts
-_LEAST_WEIGHT = 1e-9
+_SIDE, _WHITE = 8, 255.0  # side of a block [px]; largest 8-bit grey value
+# Steps are estimated from the blocks with the largest range of grey values: at least 30 and at most
+# 4000 blocks, each with a range of 24 or more.
+_MAX_BLOCKS, _MIN_BLOCKS = 4000, 30
+_MIN_RANGE = 24
+_NEAR_PX = 256  # half width of the surroundings that are tested: 1000 to 4000 blocks
+# Smaller coefficients may have been rounded to zero. The rounding of pixels to grey values leaves a
+# standard deviation of 0.29 in them.
+_MAX_ZERO = 1.4
+_MIN_COEFFICIENTS = 20
+_MAX_STEP = 255
+# A step is accepted if the mean of cos(2π c / step) over coefficients c is at least this share of
+# the value that is left after the rounding of pixels.
+_MIN_PERIODICITY = 0.6
+# Compression is detected if so many of the 64 steps are determined, and if this is at least the
+# given share of the steps for which there are enough coefficients. With JPEG the share is 0.6 or
+# more. It is at most 0.45 if nothing was compressed, or if the photograph was cropped or resized so
+# that the blocks begin elsewhere. (It is not 0 then, because coefficients that become rare above
+# `_MAX_ZERO` look like multiples.)
+_MIN_DETERMINED = 6
+_MIN_DETERMINED_SHARE = 0.55
+_MIN_SD_COUNTS = 0.3  # noise in grey values, due to quantisation alone
+_MIN_PROBABILITY = 1e-8  # of an interval; if it is smaller, only the nearer end counts
+_MIN_WEIGHT = 1e-9
 
 
 def quantisation_steps(grey: GreyArray) -> FloatArray | None:
-    """Return the steps (8, 8) that JPEG rounded the blocks' coefficients to; None if it did not.
+    """Return JPEG's quantisation steps (8, 8) of a photograph; None if there are none.
 
-    They are in grey values of the orthonormal transform, rows by vertical frequency. None, too, if
-    the photograph was cropped or resized since, or if its steps are 1 for the most part. Steps that
-    no coefficient shows are as large as the largest of those of lower frequencies.
+    They are in grey values of the orthonormal transform; the row is the vertical frequency. None is
+    returned if the photograph was not compressed, if it was cropped or resized afterwards, or if
+    most steps are 1. Steps that cannot be determined are set to the largest step of lower
+    frequencies.
     """
     height, width = (side // _SIDE * _SIDE for side in grey.shape)
     if grey.dtype != np.uint8 or not height or not width:
@@ -54,28 +65,28 @@ def quantisation_steps(grey: GreyArray) -> FloatArray | None:
     blocks = _blocks(grey[:height, :width]).reshape(-1, _SIDE, _SIDE)
     low, high = blocks.min(axis=(1, 2)), blocks.max(axis=(1, 2))
     ranges = high.astype(np.intp) - low
-    # clipped ones are not exact; of flat ones, roundings are alike and add up
-    useful = np.flatnonzero((low > 0) & (high < _WHITE) & (ranges >= _LEAST_RANGE))
-    if len(useful) < _FEWEST_BLOCKS:
+    # clipped blocks are not exact; in flat ones, rounding errors are alike and add up
+    useful = np.flatnonzero((low > 0) & (high < _WHITE) & (ranges >= _MIN_RANGE))
+    if len(useful) < _MIN_BLOCKS:
         return None
-    uneven = useful[np.argsort(-ranges[useful], kind="stable")[:_MOST_BLOCKS]]
+    uneven = useful[np.argsort(-ranges[useful], kind="stable")[:_MAX_BLOCKS]]
     size = np.abs(_transformed(blocks[uneven].astype(np.float64))).reshape(len(uneven), -1)
     steps = np.array([_step_of(each) for each in size.T])
-    seen = np.isfinite(steps)
-    if np.count_nonzero(seen) < _LEAST_DETERMINED or np.median(steps[seen]) < 2.0:
+    is_determined = np.isfinite(steps)
+    if np.count_nonzero(is_determined) < _MIN_DETERMINED or np.median(steps[is_determined]) < 2.0:
         return None
-    could_be = np.count_nonzero(size > _NONE, axis=0) >= _FEWEST_COEFFICIENTS
-    if np.count_nonzero(seen) < _LEAST_SHARE * np.count_nonzero(could_be):
+    is_determinable = np.count_nonzero(size > _MAX_ZERO, axis=0) >= _MIN_COEFFICIENTS
+    if np.count_nonzero(is_determined) < _MIN_DETERMINED_SHARE * np.count_nonzero(is_determinable):
         return None
-    known = np.where(seen, steps, 1.0).reshape(_SIDE, _SIDE)
+    known = np.where(is_determined, steps, 1.0).reshape(_SIDE, _SIDE)
     lower = np.maximum.accumulate(np.maximum.accumulate(known, axis=0), axis=1)
-    return np.where(seen.reshape(_SIDE, _SIDE), known, lower)
+    return np.where(is_determined.reshape(_SIDE, _SIDE), known, lower)
 
 
 def is_compressed_near(grey: GreyArray, centre_px: FloatArray) -> bool:
-    """Return whether JPEG compressed a photograph, as far as it shows around a place (2,).
+    """Return whether JPEG compressed a photograph, judged by the surroundings of a place (2,).
 
-    Of a whole photograph, that takes longer than to measure a disc.
+    To analyse the whole photograph would take longer than to measure a disc.
     """
     left, top = np.maximum(centre_px.astype(np.intp) - _NEAR_PX, 0) // _SIDE * _SIDE
     near = grey[top : top + 2 * _NEAR_PX, left : left + 2 * _NEAR_PX]
@@ -83,42 +94,44 @@ def is_compressed_near(grey: GreyArray, centre_px: FloatArray) -> bool:
 
 
 def _step_of(size: FloatArray) -> float:
-    """Return the step that magnitudes (n,) of coefficients are multiples of; NaN: not shown."""
-    size = size[size > _NONE]
-    if len(size) < _FEWEST_COEFFICIENTS:
+    """Return the step whose multiples the magnitudes (n,) of coefficients are; NaN if unclear."""
+    size = size[size > _MAX_ZERO]
+    if len(size) < _MIN_COEFFICIENTS:
         return math.nan
-    largest = min(int(np.quantile(size, 0.1) + _NONE), _LARGEST_STEP)
+    largest = min(int(np.quantile(size, 0.1) + _MAX_ZERO), _MAX_STEP)
     steps = np.arange(1, largest + 1)
-    shown = np.cos(np.outer(2.0 * math.pi / steps, size)).mean(axis=1)
-    best = int(np.argmax(shown))  # of fractions of the step, rounded pixels leave less
-    left = math.exp(-2.0 * math.pi**2 / (12.0 * float(steps[best]) ** 2))
-    return float(steps[best]) if shown[best] > _PERIODIC * left else math.nan
+    periodicity = np.cos(np.outer(2.0 * math.pi / steps, size)).mean(axis=1)
+    # fractions of the true step have a lower periodicity, because pixels are rounded
+    best = int(np.argmax(periodicity))
+    expected = math.exp(-2.0 * math.pi**2 / (12.0 * float(steps[best]) ** 2))
+    return float(steps[best]) if periodicity[best] > _MIN_PERIODICITY * expected else math.nan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CompressedPixels:
-    """Some pixels of a compressed photograph, and what is left of their blocks' coefficients."""
+    """Some pixels of a compressed photograph, and the intervals of their blocks' coefficients."""
 
-    # (k,): which of the pixels are in blocks that are whole and not clipped
+    # (k,): indices of the pixels in blocks that are complete and not clipped
     in_blocks: IndexArray
-    places: IndexArray  # (k,): where in the flat blocks
-    alone: IndexArray  # (n - k,): the others, which tell for themselves
+    places: IndexArray  # (k,): their indices in the flattened blocks
+    alone: IndexArray  # (n - k,): indices of the other pixels, which are compared one by one
     observed: FloatArray  # (b, 8, 8): grey values of the blocks
-    low: FloatArray  # (b, 8, 8): between which the coefficients were
+    # (b, 8, 8): limits of the coefficients before rounding
+    low: FloatArray
     high: FloatArray
 
     @classmethod
     def of(cls, grey: GreyArray, places_px: FloatArray, steps: FloatArray) -> CompressedPixels:
-        """Collect the blocks of pixels.
+        """Collect the blocks that contain pixels.
 
         Parameters
         ----------
         grey : (height, width) array of uint8
             The photograph.
         places_px : (2, n) array
-            Pixels that are modelled.
+            x, y of the pixels that are modelled.
         steps : (8, 8) array
-            As of `quantisation_steps`.
+            Result of `quantisation_steps`.
         """
         x, y = places_px.astype(np.intp)
         height, width = (side // _SIDE * _SIDE for side in grey.shape)
@@ -148,52 +161,54 @@ class CompressedPixels:
         )
 
     def misfit(self, model: FloatArray, sd: FloatArray) -> Misfit:
-        """Compare the coefficients with modelled levels (n,) under noise (n,).
+        """Compare the coefficients with modelled levels (n,) under noise `sd` (n,).
 
-        Score and weight are by coefficient (64 b,), in units of `deviations`. As of grey values
-        (`kgcp.measurement.image_model.noise`), the loss of what is farther than 3.5 standard
-        deviations grows as the logarithm.
+        Score and weight are those of the coefficients (64 b,), in units of `deviations`. As for
+        grey values (`kgcp.measurement.image_model.noise`), the loss grows as the logarithm beyond
+        3.5 standard deviations.
         """
         mean, deviation = self._expected(model, sd)
         return Misfit(*_misfit(*(each.ravel() for each in (mean, deviation, self.low, self.high))))
 
     def deviations(self, sd: FloatArray) -> FloatArray:
-        """Return the standard deviations (64 b,) of coefficients under noise (n,) of the levels.
+        """Return the standard deviations (64 b,) of coefficients under noise `sd` (n,).
 
-        What is not modelled, ground beyond the pixels, has as much noise as they have.
+        Pixels of the blocks that are not modelled, such as ground, are given the median noise of
+        those that are.
         """
         variance = (_WHITE * sd[self.in_blocks]) ** 2
         every = np.full(self.observed.size, np.median(variance) if len(variance) else 0.0)
         every[self.places] = variance
         square = _COSINES * _COSINES
         made = square @ every.reshape(self.observed.shape) @ square.T
-        return np.asarray(np.sqrt(np.maximum(made, _LEAST_SD_COUNTS**2))).ravel()
+        return np.asarray(np.sqrt(np.maximum(made, _MIN_SD_COUNTS**2))).ravel()
 
     def coefficients(self, rows: FloatArray) -> FloatArray:
-        """Return what changes (p, n) of the levels change coefficients by (p, 64 b)."""
+        """Return the changes (p, 64 b) of coefficients by changes of levels (p, n)."""
         changes = np.zeros((len(rows), self.observed.size))
         changes[:, self.places] = _WHITE * rows[:, self.in_blocks]
-        made = changes.reshape(-1, _SIDE**2) @ _COSINES_OF_BLOCK.T  # quicker than by small matrices
+        made = changes.reshape(-1, _SIDE**2) @ _COSINES_OF_BLOCK.T  # faster than 8 × 8 products
         return np.asarray(made.reshape(len(rows), -1))
 
     def levels_before(
         self, levels: FloatArray, model: FloatArray, sd: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return what is expected of levels before they were compressed.
+        """Return the expected levels before compression.
 
         Parameters
         ----------
         levels : (n,) array
-            As observed, 0…1.
+            Observed levels, 0…1.
         model, sd : (n,) arrays
-            As modelled, and the standard deviation of their noise.
+            Modelled levels, and the standard deviations of their noise.
 
         Returns
         -------
         levels : (n,) array
-            As observed where a block is cut by the photograph's border, or clipped.
+            The expected levels; the observed ones where a block is clipped or cut by the
+            photograph's border.
         variance : (n,) array
-            By which they may be off.
+            Their variances; 0 for observed ones.
         """
         mean, deviation = self._expected(model, sd)
         expected, left = _within(mean, deviation, self.low, self.high)
@@ -204,7 +219,7 @@ class CompressedPixels:
         return before, variance
 
     def _expected(self, model: FloatArray, sd: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return means and deviations (b, 8, 8) of coefficients, by the model."""
+        """Return modelled means and standard deviations of coefficients, each (b, 8, 8)."""
         values = self.observed.ravel().copy()
         values[self.places] = _WHITE * np.clip(model[self.in_blocks], 0.0, 1.0)
         mean = _transformed(values.reshape(self.observed.shape))
@@ -214,12 +229,12 @@ class CompressedPixels:
 def _within(
     mean: FloatArray, sd: FloatArray, bottom: FloatArray, top: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean and variance of normal variables within intervals."""
+    """Return mean and variance of normal variables that are known to lie within intervals."""
     low, high = (bottom - mean) / sd, (top - mean) / sd
-    below = low > 0.0  # of two tails, their difference is exact only of the smaller ones
+    below = low > 0.0  # whether lower tails are subtracted: small tails keep their digits
     probability = ndtr(np.where(below, -low, high)) - ndtr(np.where(below, -high, low))
-    possible: BoolArray = probability > _IMPOSSIBLE
-    density = np.stack((_normal(low), _normal(high))) / np.maximum(probability, _IMPOSSIBLE)
+    possible: BoolArray = probability > _MIN_PROBABILITY
+    density = np.stack((_normal(low), _normal(high))) / np.maximum(probability, _MIN_PROBABILITY)
     off = density[0] - density[1]
     expected = np.where(possible, mean + sd * off, mean)
     share = 1.0 + low * density[0] - high * density[1] - off * off
@@ -239,8 +254,8 @@ def _misfit(
     probability = ndtr(-near) - ndtr(-far)
     at_near, at_far = _normal(near) / probability, _normal(far) / probability
     score = at_near - at_far
-    # an interval much wider than the noise, of which the mean is well within, tells nothing
-    weight = np.maximum(score * score + far * at_far - near * at_near, _LEAST_WEIGHT)
+    # an interval much wider than the noise with the mean well inside tells nothing
+    weight = np.maximum(score * score + far * at_far - near * at_near, _MIN_WEIGHT)
     weight = np.where(beyond > 1.0, score / (OUTLIER_SIGMAS * beyond**2), weight)
     loss = score * OUTLIER_SIGMAS * np.log(beyond) - np.log(probability)
     return float(loss.sum()), sign * score / beyond, weight
@@ -263,7 +278,7 @@ _COSINES_OF_BLOCK = np.kron(_COSINES, _COSINES)  # (64, 64)
 
 
 def _transformed(blocks: FloatArray) -> FloatArray:
-    """Return the coefficients of blocks (…, 8, 8), of grey values about their middle."""
+    """Return the coefficients of blocks (…, 8, 8) of grey values, relative to 128."""
     return _COSINES @ (blocks - 128.0) @ _COSINES.T
 
 
@@ -272,6 +287,6 @@ def _restored(coefficients: FloatArray) -> FloatArray:
 
 
 def _blocks(grey: NDArray[_Pixel]) -> NDArray[_Pixel]:
-    """Return the blocks (rows, columns, 8, 8) of a picture of whole ones."""
+    """Return the blocks (rows, columns, 8, 8) of an image that consists of complete blocks."""
     rows, columns = (side // _SIDE for side in grey.shape)
     return grey.reshape(rows, _SIDE, columns, _SIDE).swapaxes(1, 2)

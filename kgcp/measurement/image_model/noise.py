@@ -1,11 +1,12 @@
-"""The likelihood of grey values: noise that follows the level, clipped and outlying pixels.
+"""The likelihood of grey values: level-dependent noise, clipped pixels and outliers.
 
-Noise is estimated from the plateaus of ink and plate, in between it grows linearly with the level
-(shot noise); near edges it is inflated to what the residuals there show (jagged prints, JPEG).
-Under a tone curve it is estimated in bands of the white share: the curve raises that of dark
-levels, and demosaicing leaves most of it on the dark side of edges.
-Clipped pixels are censored observations (Tobin): they only say "at least white". Outliers (dirt,
-a finger of shadow, a hidden part) are weighted down as by a heavy-tailed distribution.
+The noise variance is estimated on ink and on plate, and taken as linear in the level between them
+(shot noise). Near edges it is inflated if the residuals there scatter more (jagged prints, JPEG).
+Under a tone curve it is estimated in bands of the white share instead: the curve amplifies the
+noise of dark levels, and demosaicing leaves most of its errors on the dark side of edges.
+
+Clipped pixels are censored observations (Tobin): they only say "at least white". Outliers (dirt, a
+narrow shadow, a hidden part) are downweighted, as if the distribution had heavy tails.
 """
 
 from __future__ import annotations
@@ -19,84 +20,98 @@ from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 
 OUTLIER_SIGMAS = 3.5
-"""Farther from the model than so many standard deviations, a value is an outlier."""
-# Sigmas short of the limit at which a clipped pixel pulls as strongly as an outlier.
-_FARTHEST_CLIPPED = 3.23249
-_MIN_NOISE_COUNTS = 0.3  # quantisation alone: 1/√12 of a grey value
-_TRIM = 0.9
-_TRIMMED_VARIANCE = 0.6230  # of a unit normal variable within its central 90 %
+"""A value farther from the model than so many standard deviations is an outlier."""
+# Distance below the clipping limit, in σ, at which the score of a clipped pixel equals that of an
+# outlier at its limit. Beyond, the score is kept constant.
+_MAX_CLIPPED_SIGMAS = 3.23249
+_MIN_NOISE_COUNTS = 0.3  # in grey values; quantisation alone makes 1/√12
+_KEPT_SHARE = 0.9  # of the squared residuals, in the trimmed variance
+_TRIMMED_VARIANCE = 0.6230  # of a unit normal variable, within its central 90 %
 _MIN_SAMPLES = 8
-# Of the variance of ink, that plate may have in it. What jagged edges scatter is not that: without
-# a limit, the noise of ink was taken for none, and a tone curve did not settle.
-_MOST_OF_PLATE = 0.1
-# Values pile up at a top if it has more than this share of the pixels, and less than that lies just
-# below, above this share of the top.
-_PILED_UP, _BELOW_TOP = 0.05, 0.98
-_MOST_SMEARED = 6  # grey values below the top in which smeared pixels are looked for
-# Compression smears if these exceed the next six by this share of them: in 120 frames without it by
-# 0.8 at most, unless the plate is at the top itself; in 200 JPEGs nearly always by 1 to 30. As long
-# as the share was one of the clipped pixels, 0.15, the smears of large plates counted as exact: of
-# burnt rings of R > 26 px in JPEGs of a known response, distances were off by 0.12 % (RMS), now by
-# 0.005 %. What lies within so many standard deviations of the excess counts as clipped, too.
-_SMEARED, _SMEAR_SIGMAS = 1.0, 2.5
-# Beside edges, grey values pile up just below the top without compression, too: the blur ends
-# there, and in colour one channel is clipped after the other. Compression smears over whole blocks.
-# So among pixels just below the top, those with no darker one beside them must have at least this
-# part of the share that they have among all near the top. In JPEGs of burnt discs of R 5 to 15 px
-# (quality 75 to 97) they nearly always have 0.4 to 3 times that share. Without compression, where
-# film's curve made 47 of 240 discs look smeared, they mostly have none. In six of the photographs
-# `ros10`, 239 of 593 discs looked smeared by their edges alone; their centres scattered by 0.103 px
-# and scatter by 0.085 px now.
-_AWAY = 0.2
+# Largest share of the variance of ink pixels that is attributed to the plate in them. Jagged edges
+# scatter more than such pixels. Without a limit, that was subtracted from the noise of ink until
+# nothing was left, and the tone curve did not converge.
+_MAX_PLATE_IN_INK = 0.1
+# A sensor that clips below full scale is recognised by equal values: more than the first share of
+# the pixels has the largest value, and fewer lie just below it, down to the second share of that
+# value.
+_PILED_UP, _JUST_BELOW = 0.05, 0.98
+# Compression smears clipped pixels over some grey values below the limit ("smeared" pixels). They
+# are looked for in the next six grey values, and their number there is compared with that in the
+# six below.
+_MAX_SMEAR_COUNTS = 6
+# Compression is detected if the six contain more pixels than the six below, by at least the first of
+# these shares of the latter. In 120 frames without compression the excess was at most 0.8, unless
+# the plate itself was at the limit. In 200 JPEGs it was nearly always 1 to 30. Before, the excess
+# was compared with 0.15 of the clipped pixels. Then the smeared pixels of large plates went
+# undetected and counted as exact: burnt rings of R > 26 px in JPEGs with a known response had
+# distances off by 0.12 % (RMS), now by 0.005 %. Pixels within so many standard deviations of the
+# excess's distribution count as clipped, too.
+_MIN_SMEAR_EXCESS, _SMEAR_SIGMAS = 1.0, 2.5
+# Beside edges, grey values pile up just below the limit without compression, too: blur ends there,
+# and in colour frames one channel clips after the other. But compression smears over whole blocks.
+# Therefore smeared pixels must also show away from edges, that is among pixels without a darker
+# neighbour. Their share there must be at least this fraction of their share among all pixels near
+# the limit. In JPEGs of burnt discs of R 5 to 15 px (quality 75 to 97) the fraction is nearly
+# always 0.4 to 3. Without compression it is mostly 0, even where film's curve made 47 of 240 discs
+# look smeared. In six of the photographs `ros10`, 239 of 593 discs looked smeared because of their
+# edges alone; with this test, the scatter of their centres fell from 0.103 px to 0.085 px.
+_MIN_SMEARED_AWAY = 0.2
 
-# Share of what a model exceeds a ceiling by that is compared with seen pixels. Without any, a model
-# that is far too bright would not come back. Of burnt discs in JPEGs, radii were off by up to 0.16
-# px without a ceiling, and are by 0.09 px.
+# If light is clipped before the noise is added (`Censoring.ceiling`), a seen pixel is compared with
+# the clipped model. So much of what the model exceeds the ceiling by still counts: without it, a
+# model that is far too bright would never return. Radii of burnt discs in JPEGs were off by up to
+# 0.16 px without a ceiling, now by up to 0.09 px.
 _BEYOND_CLIPPING = 0.1
 
-# Bands of the white share: limits and middles. They are narrow at both ends, where demosaicing and
-# tone curves change the noise most. Errors of the flight `consumer` fell from 0.0103 to 0.0087 %.
-_LIMITS = np.array([0.02, 0.15, 0.35, 0.65, 0.85, 0.98])
-_MIDDLES = np.array([0.005, 0.07, 0.25, 0.5, 0.75, 0.93, 0.995])
-_LINE_PIXELS = 10.0  # of a band, that the line between the variances of ink and plate is worth
+# Limits and middles of the bands of the white share. They are narrow at both ends, where
+# demosaicing and tone curves change the noise most. With bands, distance errors of the flight
+# `consumer` fell from 0.0103 to 0.0087 %.
+_BAND_LIMITS = np.array([0.02, 0.15, 0.35, 0.65, 0.85, 0.98])
+_BAND_MIDDLES = np.array([0.005, 0.07, 0.25, 0.5, 0.75, 0.93, 0.995])
+# The variance of a band is a weighted mean of its own and of that on the line between ink and
+# plate. The line weighs as much as so many pixels.
+_LINE_PIXELS = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Censoring:
-    """Clipped pixels, and the limits that clip them."""
+    """Clipped pixels, and the levels at which they are clipped."""
 
-    # levels at and beyond which a value only says "at least" and "at most"
+    # levels from which on a value only says "at least" or "at most"
     high: float
     low: float
-    # (n,): the pixels concerned
+    # (n,): which pixels are clipped
     at_high: BoolArray
     at_low: BoolArray
-    # where light is clipped before its noise comes, which is that of compression; infinite: after
+    # Levels at which light is clipped before the noise is added, as that of compression is.
+    # Infinite if it is clipped after.
     ceiling: float = math.inf
     floor: float = -math.inf
-    brightest: float = 1.0  # grey value that clipped white is seen with
+    brightest: float = 1.0  # level of clipped white in the frame
 
     @property
     def is_clipped(self) -> BoolArray:
-        """Which pixels (n,) are clipped, at either end."""
+        """Whether each pixel (n,) is clipped, at either end."""
         return self.at_high | self.at_low
 
     @property
     def share(self) -> float:
-        """Share of clipped pixels; 0 of none."""
+        """Share of clipped pixels; 0 if there are no pixels."""
         return float(np.count_nonzero(self.is_clipped) / max(len(self.at_high), 1))
 
 
 def find_censoring(levels: FloatArray, levels_per_count: float, width: int) -> Censoring:
-    """Find where a window is clipped: at the ends of the range, or where values pile up.
+    """Find the levels at which a window is clipped, and its clipped pixels.
 
-    Compression smears clipped pixels over some grey values below, which say no more than they do.
-    Its errors come after clipping.
+    These levels are the ends of the range, or where values pile up below them. If compression has
+    smeared clipped pixels over some neighbouring grey values, these count as clipped, too. Errors
+    of compression are added after clipping: then `ceiling` and `floor` are set.
 
     Parameters
     ----------
     levels : (n,) array
-        Grey values, 0…1 of the data type's range, row by row.
+        Grey values, 0…1 of the data type's range, in row-major order.
     levels_per_count : float
         Step from one grey value to the next.
     width : int
@@ -105,12 +120,12 @@ def find_censoring(levels: FloatArray, levels_per_count: float, width: int) -> C
     high, low = 1.0 - 0.5 * levels_per_count, 0.5 * levels_per_count
     top, near_top, near_bottom = float(levels.max()), *_pixels_near_ends(levels, levels_per_count)
     brightest = 1.0
-    # a sensor of fewer bits than its files saturates below the end of the range
+    # a sensor with fewer bits than its files saturates below the end of the range
     if top < high:
         at_top = float(np.mean(levels == top))
-        if at_top > _PILED_UP > float(np.mean(levels > _BELOW_TOP * top)) - at_top:
+        if at_top > _PILED_UP > float(np.mean(levels > _JUST_BELOW * top)) - at_top:
             high, brightest = top - 0.5 * levels_per_count, top
-    of_top, of_bottom = (_smeared_over(number) for number in (near_top, near_bottom))
+    of_top, of_bottom = (_smear_counts(number) for number in (near_top, near_bottom))
     if of_top and not _is_smeared_away(1.0 - levels, levels_per_count, width):
         of_top = 0
     if of_bottom and not _is_smeared_away(levels, levels_per_count, width):
@@ -122,8 +137,8 @@ def find_censoring(levels: FloatArray, levels_per_count: float, width: int) -> C
 
 @compiled
 def _pixels_near_ends(levels: FloatArray, levels_per_count: float) -> IndexArray:
-    """Count pixels (2, 13) by their distance in grey values from the top and from the bottom."""
-    number = np.zeros((2, 2 * _MOST_SMEARED + 1), np.intp)
+    """Return the numbers of pixels (2, 13) that are 0…12 grey values from top and from bottom."""
+    number = np.zeros((2, 2 * _MAX_SMEAR_COUNTS + 1), np.intp)
     for level in levels:
         from_top, from_bottom = (1.0 - level) / levels_per_count, level / levels_per_count
         if from_top < number.shape[1] - 0.5:
@@ -133,20 +148,20 @@ def _pixels_near_ends(levels: FloatArray, levels_per_count: float) -> IndexArray
     return number
 
 
-def _smeared_over(number: IndexArray) -> int:
-    """Return over how many grey values clipped pixels are smeared; 0 if they are not.
+def _smear_counts(number: IndexArray) -> int:
+    """Return over how many grey values compression has smeared clipped pixels; 0 if it has not.
 
     Parameters
     ----------
     number : (13,) array of int
-        Pixels by grey values from the end of the range.
+        Number of pixels by their distance from the end of the range, in grey values.
     """
     if number[0] <= _MIN_SAMPLES:
         return 0
-    steps = np.arange(1, _MOST_SMEARED + 1)
-    excess = np.maximum(number[steps] - number[_MOST_SMEARED + 1 :].mean(), 0.0)
-    least = max(_SMEARED * number[_MOST_SMEARED + 1 :].sum(), _MIN_SAMPLES)
-    if not least <= excess.sum() <= number[0]:  # more of them are a plateau just below the end
+    steps = np.arange(1, _MAX_SMEAR_COUNTS + 1)
+    excess = np.maximum(number[steps] - number[_MAX_SMEAR_COUNTS + 1 :].mean(), 0.0)
+    least = max(_MIN_SMEAR_EXCESS * number[_MAX_SMEAR_COUNTS + 1 :].sum(), _MIN_SAMPLES)
+    if not least <= excess.sum() <= number[0]:  # more than are clipped: a plateau near the end
         return 0
     return math.ceil(_SMEAR_SIGMAS * math.sqrt(float(excess @ steps**2 / excess.sum())))
 
@@ -158,9 +173,9 @@ def _is_smeared_away(from_end: FloatArray, levels_per_count: float, width: int) 
     Parameters
     ----------
     from_end : (n,) array
-        Levels, as distances from the end.
+        Distances of the levels from the end of the range.
     """
-    reach, clipped = (_MOST_SMEARED + 0.5) * levels_per_count, 0.5 * levels_per_count
+    reach, clipped = (_MAX_SMEAR_COUNTS + 0.5) * levels_per_count, 0.5 * levels_per_count
     height = len(from_end) // width
     near, smeared, away, smeared_away = 0, 0, 0, 0
     for row in range(1, height - 1):
@@ -176,15 +191,15 @@ def _is_smeared_away(from_end: FloatArray, levels_per_count: float, width: int) 
             smeared += is_smeared
             away += is_away
             smeared_away += is_smeared and is_away
-    return smeared_away > 0 and smeared_away * near >= _AWAY * smeared * away
+    return smeared_away > 0 and smeared_away * near >= _MIN_SMEARED_AWAY * smeared * away
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GreyNoise:
-    """Noise of n pixels."""
+    """Standard deviations of n pixels' noise, as levels."""
 
-    sd: FloatArray  # (n,): as level
-    plateau_sd: FloatArray  # (n,): without what only edges have
+    sd: FloatArray  # (n,)
+    plateau_sd: FloatArray  # (n,): without the excess at edges
 
 
 def estimate_noise(
@@ -197,7 +212,7 @@ def estimate_noise(
     from_edges: bool = False,
     is_linear_in_share: bool = True,
 ) -> GreyNoise:
-    """Return the noise of every pixel from the residuals of a fit.
+    """Estimate the noise of every pixel from the residuals of a fit.
 
     Parameters
     ----------
@@ -206,16 +221,18 @@ def estimate_noise(
     share : (n,) array
         White share.
     usable : (n,) array of bool
-        Not clipped.
+        Pixels to estimate from: those that are not clipped.
     levels_per_count : float
         Step from one grey value to the next.
     in_bands : bool
-        Whether noise is estimated in bands of the share, instead of along a line from ink to plate.
+        Whether the variance is estimated in bands of the share, instead of on a line from ink to
+        plate.
     from_edges : bool
-        Whether the noise of ink, or of plate, is taken from edges where there is too little of it.
+        Whether the noise of ink, or of plate, is taken from edges if there are too few of its
+        pixels.
     is_linear_in_share : bool
-        Whether the variance is about linear in the share: then that of ink and of plate alone is
-        told from pixels that have a little of the other one in them.
+        Whether the variance is about linear in the share. If so, the variances of pure ink and pure
+        plate are extrapolated, since pixels of each contain a little of the other.
     """
     sd, plateau_sd = np.empty_like(residuals), np.empty_like(residuals)
     floor = (_MIN_NOISE_COUNTS * levels_per_count) ** 2
@@ -257,16 +274,16 @@ def _estimate(
 
 @compiled
 def _interpolate(share: FloatArray, log_sd: FloatArray, sd: FloatArray) -> None:
-    """Fill in the deviations between those of the bands' middles, linear in the logarithm.
+    """Fill in standard deviations, interpolated between the bands' middles in the logarithm.
 
-    Without a branch and without a library's exponential, so that vector units take several: its
-    argument is halved ten times, and the power of it squared as often.
+    The loops have no branches and call no library function, so that they are vectorised. The
+    exponential is a polynomial of the argument divided by 2¹⁰, squared ten times.
     """
     for i in range(len(share)):
         value = log_sd[0]
-        for k in range(len(_MIDDLES) - 1):
-            width = _MIDDLES[k + 1] - _MIDDLES[k]
-            within = min(max(share[i] - _MIDDLES[k], 0.0), width)
+        for k in range(len(_BAND_MIDDLES) - 1):
+            width = _BAND_MIDDLES[k + 1] - _BAND_MIDDLES[k]
+            within = min(max(share[i] - _BAND_MIDDLES[k], 0.0), width)
             value += within * ((log_sd[k + 1] - log_sd[k]) / width)
         sd[i] = value
     for i in range(len(sd)):
@@ -279,7 +296,7 @@ def _interpolate(share: FloatArray, log_sd: FloatArray, sd: FloatArray) -> None:
 
 @inlined
 def _variance_at(share: float, ink: float, white: float, excess: float, floor: float) -> float:
-    """Return the variance between those of ink and white, inflated towards the middle of edges."""
+    """Return the variance at a share: on the line from ink to white, inflated at edges."""
     within = min(max(share, 0.0), 1.0)
     return max(ink + (white - ink) * within, floor) * (1.0 + excess * 4.0 * within * (1.0 - within))
 
@@ -291,12 +308,12 @@ def _band_variances(
     usable: BoolArray,
     of_line: tuple[float, float, float, float],
 ) -> FloatArray:
-    """Return the variances of the bands, shrunk towards `_variance_at` where pixels are few."""
+    """Return the variances of the bands, drawn towards `_variance_at` if there are few pixels."""
     ink, white, excess, floor = of_line
     squares, starts = _by_band(residuals, share, usable)
-    variances = np.empty(len(_MIDDLES))
-    for band in range(len(_MIDDLES)):
-        variances[band] = _variance_at(_MIDDLES[band], ink, white, excess, floor)
+    variances = np.empty(len(_BAND_MIDDLES))
+    for band in range(len(_BAND_MIDDLES)):
+        variances[band] = _variance_at(_BAND_MIDDLES[band], ink, white, excess, floor)
         number = starts[band + 1] - starts[band]
         shown = _trimmed_variance(squares[starts[band] : starts[band + 1]])
         if not math.isnan(shown):
@@ -309,9 +326,9 @@ def _band_variances(
 def _by_band(
     residuals: FloatArray, share: FloatArray, usable: BoolArray
 ) -> tuple[FloatArray, IndexArray]:
-    """Return the squares of usable residuals, band after band, and where each band starts."""
-    bands, count = np.zeros(len(share), np.uint8), len(_MIDDLES)
-    for limit in _LIMITS:
+    """Return the squares of usable residuals, sorted by band, and where each band starts."""
+    bands, count = np.zeros(len(share), np.uint8), len(_BAND_MIDDLES)
+    for limit in _BAND_LIMITS:
         for i in range(len(share)):
             bands[i] += share[i] >= limit
     starts = np.zeros(count + 1, np.intp)
@@ -338,11 +355,13 @@ def _plateau_variances(
 ) -> tuple[float, float]:
     """Return the variances of ink and plate.
 
-    The pixels of a plateau have a little of the other one in them: of dark ink, whose noise is
-    small, that is 3 to 8 % of the variance. So the line through both is taken to the ends. Of plain
-    discs under an unknown tone curve it is not: that curve was learnt less well. If one plateau is
-    not seen, it is that of the other, or what edges tell; if neither is, both are that of all
-    pixels.
+    Pixels that count as ink contain a little plate and vice versa. Dark ink has little noise, and
+    the plate in it makes 3 to 8 % of the variance. Therefore the line through the mean variances
+    and mean shares of both is extrapolated to the shares 0 and 1. This is not done for plain discs
+    under an unknown tone curve, because the curve was learnt less well then.
+
+    If there are too few pixels of ink or of plate, its variance is that of the other one, or
+    (`from_edges`) that at edges. If there are too few of both, the variance of all pixels is used.
     """
     ink, of_ink = _mean_variance(residuals, share, usable, -math.inf, 0.15)
     white, of_white = _mean_variance(residuals, share, usable, 0.85, math.inf)
@@ -364,7 +383,7 @@ def _plateau_variances(
         of_ink = 0.0 if is_ink_seen else of_ink
         of_white = 1.0 if is_white_seen else of_white
     slope = (white - ink) / (of_white - of_ink)
-    least_ink = (1.0 - _MOST_OF_PLATE) * ink if is_ink_seen else floor
+    least_ink = (1.0 - _MAX_PLATE_IN_INK) * ink if is_ink_seen else floor
     return max(ink - slope * of_ink, least_ink, floor), max(white + slope * (1.0 - of_white), floor)
 
 
@@ -372,7 +391,7 @@ def _plateau_variances(
 def _mean_variance(
     residuals: FloatArray, share: FloatArray, usable: BoolArray, low: float, high: float
 ) -> tuple[float, float]:
-    """Return the variance of usable pixels with a share between limits, and their mean share."""
+    """Return variance and mean share of the usable pixels with a share between limits."""
     squares, number, total = np.empty(len(share)), 0, 0.0
     for i in range(len(share)):
         if usable[i] and low < share[i] < high:
@@ -384,23 +403,23 @@ def _mean_variance(
 
 @compiled
 def median_at_edges(
-    values: FloatArray, share: FloatArray, ink: float, plate: float, otherwise: float
+    values: FloatArray, share: FloatArray, low: float, high: float, default: float
 ) -> float:
-    """Return the median of values (n,) where the white share (n,) is between two limits."""
+    """Return the median of values (n,) at pixels whose white share (n,) is between two limits."""
     at_edges, count = np.empty(len(values)), 0
     for i in range(len(values)):
-        if ink < share[i] < plate:
+        if low < share[i] < high:
             at_edges[count] = values[i]
             count += 1
-    return float(np.median(at_edges[:count])) if count else otherwise
+    return float(np.median(at_edges[:count])) if count else default
 
 
 @compiled
 def _trimmed_variance(squares: FloatArray) -> float:
-    """Return the variance of the central part, scaled to the whole; NaN if there are too few."""
+    """Return the variance from the smallest squares, scaled to all; NaN if there are too few."""
     if len(squares) < _MIN_SAMPLES:
         return math.nan
-    count = max(1, int(_TRIM * len(squares)))
+    count = max(1, int(_KEPT_SHARE * len(squares)))
     total = 0.0
     for square in np.partition(squares, count - 1)[:count]:
         total += square
@@ -409,20 +428,20 @@ def _trimmed_variance(squares: FloatArray) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Misfit:
-    """Negative log-likelihood of a window, and what Newton's method needs of it."""
+    """Negative log-likelihood of a window, with its derivatives for Newton's method."""
 
     total: float  # up to a constant
-    score: FloatArray  # (n,): its derivative with respect to the standardised model, times −1
-    weight: FloatArray  # (n,): its second derivative, made positive
+    score: FloatArray  # (n,): first derivative by the model in units of σ, with opposite sign
+    weight: FloatArray  # (n,): second derivative by the same, made positive
 
 
 def misfit(levels: FloatArray, model: FloatArray, sd: FloatArray, censoring: Censoring) -> Misfit:
     """Compare observed and modelled levels (n,) under noise of standard deviation `sd` (n,).
 
-    Far from the model the density of a seen pixel falls like a power of the distance, so that its
-    loss grows as the logarithm; that of a clipped pixel falls exponentially, its loss grows
-    linearly. Beyond where light is clipped before its noise comes, hardly anything of the model
-    shows in a seen pixel.
+    Far from the model, the density of a pixel that is not clipped falls like a power of the
+    distance, so that its loss grows as the logarithm. The density of a clipped pixel falls
+    exponentially, so that its loss grows linearly. Beyond `censoring.ceiling` and `floor`, the
+    model hardly affects the level of a pixel that is not clipped.
     """
     clips = (censoring.at_low, censoring.at_high)
     limits = (censoring.low, censoring.high, censoring.floor, censoring.ceiling)
@@ -445,7 +464,7 @@ def _misfit(
         if at_low[i] or at_high[i]:
             sign, limit = (-1.0, low) if at_low[i] else (1.0, high)
             missing = sign * (limit - model[i]) / sd[i]
-            near = min(missing, _FARTHEST_CLIPPED)
+            near = min(missing, _MAX_CLIPPED_SIGMAS)
             tail = 0.5 * math.erfc(near * math.sqrt(0.5))
             hazard = math.exp(-0.5 * near * near) / (math.sqrt(2.0 * math.pi) * tail)
             total += hazard * (missing - near) - math.log(tail)
@@ -468,19 +487,21 @@ def _misfit(
     return total, score, weight
 
 
-def outlier_share(found: Misfit, model: FloatArray, censoring: Censoring) -> float:
-    """Return the share of seen pixels that count less than half; 1 if none is seen.
+def outlier_share(fit: Misfit, model: FloatArray, censoring: Censoring) -> float:
+    """Return the share of pixels not clipped that have less than half of their weight.
+
+    It is 1 if all pixels are clipped.
 
     Parameters
     ----------
-    found : Misfit
+    fit : Misfit
         Of the pixels (n,).
     model : (n,) array
         Their modelled levels.
     censoring : Censoring
-        Which of them are clipped, and where light is.
+        Which of them are clipped, and where the light is.
     """
     seen = ~censoring.is_clipped
     is_beyond = (model > censoring.ceiling) | (model < censoring.floor)
     half = np.where(is_beyond, 0.5 * _BEYOND_CLIPPING**2, 0.5)
-    return float(np.mean((found.weight < half)[seen])) if seen.any() else 1.0
+    return float(np.mean((fit.weight < half)[seen])) if seen.any() else 1.0
