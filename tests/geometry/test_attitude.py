@@ -17,7 +17,7 @@ from kgcp.georef.local_frame import LocalFrame
         ("EPSG:4258", (11.5, 48.1, 560.0)),
     ],
 )
-def test_down_is_the_local_vertical_of_any_map(crs: str, origin: tuple[float, ...]) -> None:
+def test_down_is_the_local_vertical_in_any_map_frame(crs: str, origin: tuple[float, ...]) -> None:
     opk_deg = np.array([[3.0, -8.0, 71.0], [-12.0, 1.0, -160.0]])
     local_frame = LocalFrame.at(crs, np.array(origin))
     camera_from_enu = CAMERA_FROM_PHOTO @ np.swapaxes(
@@ -27,5 +27,5 @@ def test_down_is_the_local_vertical_of_any_map(crs: str, origin: tuple[float, ..
     assert np.allclose(down_in_camera(opk_deg), expected, atol=1e-8)
 
 
-def test_a_camera_that_looks_straight_down_sees_down_ahead() -> None:
+def test_down_is_the_optical_axis_of_a_nadir_camera() -> None:
     assert np.allclose(down_in_camera(np.array([[0.0, 0.0, 137.0]])), [[0.0, 0.0, 1.0]])

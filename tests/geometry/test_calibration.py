@@ -35,7 +35,7 @@ CAMERA = Camera(
 
 
 @pytest.mark.parametrize("name", CALIBRATION_PARAMETERS)
-def test_derivatives_are_those_of_the_camera(name: str) -> None:
+def test_calibration_derivatives_equal_finite_differences(name: str) -> None:
     points = np.array([[0.31, -0.22], [-0.05, 0.11], [0.0, 0.0], [-0.3, -0.2]])
     step = 1e-3 if name in ("fx", "fy", "cx", "cy") else 1e-5
     high, low = (
@@ -47,7 +47,7 @@ def test_derivatives_are_those_of_the_camera(name: str) -> None:
     assert np.allclose(derivative, (high - low) / (2.0 * step), rtol=1e-5, atol=1e-6)
 
 
-def test_parameters_that_are_not_named_are_exact() -> None:
+def test_parameters_not_named_have_zero_covariance() -> None:
     whole = CalibrationCovariance.of(("k2", "fx"), np.array([[4.0, 1.0], [1.0, 9.0]])).cov
     fx, k2 = CALIBRATION_PARAMETERS.index("fx"), CALIBRATION_PARAMETERS.index("k2")
     assert (whole[fx, fx], whole[k2, k2], whole[fx, k2], whole[k2, fx]) == (9.0, 4.0, 1.0, 1.0)
@@ -55,7 +55,7 @@ def test_parameters_that_are_not_named_are_exact() -> None:
 
 
 @pytest.mark.parametrize("correlation", [-1.0, 0.0, 0.5, 1.0])
-def test_units_as_different_as_pixels_and_distortion_are_no_trouble(correlation: float) -> None:
+def test_parameters_of_very_different_scale_are_accepted(correlation: float) -> None:
     sd = np.array([20.0, 1e-7])
     cov = np.outer(sd, sd) * [[1.0, correlation], [correlation, 1.0]]
     assert CalibrationCovariance.of(("fx", "k3"), cov).cov[0, 0] == 400.0
@@ -74,7 +74,7 @@ def test_units_as_different_as_pixels_and_distortion_are_no_trouble(correlation:
         (("fx", "fy"), np.array([[1.0, 0.5], [0.5, 0.0]]), "cov: is not a covariance"),
     ],
 )  # fmt: skip
-def test_what_is_no_covariance_is_refused(
+def test_matrices_that_are_not_covariances_are_rejected(
     names: tuple[str, ...], cov: FloatArray, message: str
 ) -> None:
     with pytest.raises(SettingError, match=message):

@@ -36,7 +36,7 @@ def opencv_pixels(camera: Camera, points: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_projection_is_opencv_s(lens: str) -> None:
+def test_projection_equals_opencv(lens: str) -> None:
     rng = np.random.default_rng(4)
     points = rng.uniform((-3.0, -2.0, 9.0), (3.0, 2.0, 30.0), (200, 3))
     camera = LENSES[lens]
@@ -49,7 +49,7 @@ MATRIX = np.array([[2306.0, 0.0, 792.6], [0.0, 2302.0, 543.9], [0.0, 0.0, 1.0]])
 
 
 @pytest.mark.parametrize("count", [0, 4, 5, 8, 12, 14])
-def test_a_camera_of_opencv_s_numbers_projects_as_opencv_does(count: int) -> None:
+def test_from_opencv_projects_as_opencv_does(count: int) -> None:
     rng = np.random.default_rng(count)
     distortion = np.zeros(count)
     distortion[:8] = (0.21, -0.12, 4e-4, -3e-4, 0.02, 0.28, -0.15, 0.03)[:count]
@@ -61,7 +61,7 @@ def test_a_camera_of_opencv_s_numbers_projects_as_opencv_does(count: int) -> Non
     assert (camera.width, camera.height) == (1600, 1100)
 
 
-def test_what_opencv_does_not_know_can_be_given_beside_its_numbers() -> None:
+def test_from_opencv_takes_response_and_readout() -> None:
     camera = Camera.from_opencv(
         MATRIX.tolist(), [0.0] * 5, (1600, 1100), response=Response.LINEAR, readout_s=0.02
     )
@@ -90,7 +90,7 @@ def changed(row: int, column: int, value: float) -> FloatArray:
         (MATRIX, [0.0, np.inf, 0.0, 0.0], "k2: is not a finite number"),
     ],
 )
-def test_numbers_that_are_no_camera_of_this_model_are_refused(
+def test_from_opencv_rejects_other_models(
     matrix: FloatArray, distortion: list[float], words: str
 ) -> None:
     with pytest.raises(SettingError, match=words):
@@ -98,7 +98,7 @@ def test_numbers_that_are_no_camera_of_this_model_are_refused(
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_circles_are_projected_point_by_point(lens: str) -> None:
+def test_projected_circles_equal_projected_points(lens: str) -> None:
     axes = Rotation.from_euler("xyz", (0.4, -0.3, 1.1)).as_matrix()
     centre, radii, angles = np.array([0.8, -0.5, 7.0]), np.array([0.1, 0.45]), np.arange(7.0)
     circle = np.stack((np.cos(angles), np.sin(angles)), axis=-1)
@@ -110,14 +110,14 @@ def test_circles_are_projected_point_by_point(lens: str) -> None:
 
 
 @given(lens=st.sampled_from(sorted(LENSES)), x=st.floats(-0.5, 1599.5), y=st.floats(-0.5, 1099.5))
-def test_undistorted_pixels_come_back(lens: str, x: float, y: float) -> None:
+def test_distort_inverts_undistort(lens: str, x: float, y: float) -> None:
     pixel = np.array([[x, y]])
     camera = LENSES[lens]
     np.testing.assert_allclose(camera.distort(camera.undistort(pixel)), pixel, rtol=0.0, atol=1e-8)
 
 
 @given(lens=st.sampled_from(sorted(LENSES)), x=st.floats(-0.35, 0.35), y=st.floats(-0.25, 0.25))
-def test_jacobian_is_the_derivative(lens: str, x: float, y: float) -> None:
+def test_distort_jacobian_equals_finite_differences(lens: str, x: float, y: float) -> None:
     camera, step = LENSES[lens], 1e-6
     analytic = camera.distort_jacobian(np.array([[x, y]]))[0]
     for column, axis in enumerate(np.eye(2)):
@@ -125,7 +125,7 @@ def test_jacobian_is_the_derivative(lens: str, x: float, y: float) -> None:
         np.testing.assert_allclose(analytic[:, column], (high - low)[0] / (2.0 * step), atol=1e-4)
 
 
-def test_pixels_beyond_the_fold_are_nan_and_leave_the_others_alone() -> None:
+def test_only_pixels_beyond_the_fold_are_nan() -> None:
     """With k1 = −0.5 the distorted radius r − r³/2 never exceeds 0.544."""
     camera = replace(PLAIN, k1=-0.5)
     farthest = 2.0 / 3.0 * np.sqrt(2.0 / 3.0)
@@ -148,7 +148,7 @@ FOLDED: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("tangential", [0.0, 2e-3])
 @pytest.mark.parametrize("lens", FOLDED)
-def test_every_ray_before_the_fold_is_found_and_no_other(lens: str, tangential: float) -> None:
+def test_exactly_the_rays_before_the_fold_are_found(lens: str, tangential: float) -> None:
     plain = Camera(4000, 3000, 1800.0, 1790.0, 2010.0, 1490.0)
     camera = replace(plain, p1=tangential, p2=-0.5 * tangential, **FOLDED[lens])
     # rays from the axis outwards, up to where the distortion turns
@@ -172,7 +172,7 @@ def test_every_ray_before_the_fold_is_found_and_no_other(lens: str, tangential: 
     assert (np.hypot(*found.T) <= largest + 0.03).all()
 
 
-def test_any_shape_of_points_is_kept() -> None:
+def test_the_shape_of_point_arrays_is_kept() -> None:
     camera = LENSES["rational"]
     grid = np.stack(np.meshgrid(np.linspace(0.0, 1500.0, 5), np.linspace(0.0, 1000.0, 3)), axis=-1)
     assert camera.undistort(grid).shape == grid.shape
@@ -182,7 +182,7 @@ def test_any_shape_of_points_is_kept() -> None:
 
 
 @pytest.mark.parametrize("count", [2, 3, 4, 8])
-def test_bins_see_the_same_rays_at_the_same_times(count: int) -> None:
+def test_a_binned_camera_has_the_same_rays_and_delays(count: int) -> None:
     camera = replace(LENSES["rational"], width=1608, height=1104, readout_s=0.03)
     bins = np.array([[0.0, 0.0], [131.0, 20.0], [200.0, 137.0]])
     pixels = count * bins + 0.5 * (count - 1)
@@ -196,7 +196,7 @@ def test_bins_see_the_same_rays_at_the_same_times(count: int) -> None:
     [("fx", 0.0), ("fy", -1.0), ("width", 1), ("cx", 5000.0), ("cy", float("nan")),
      ("k2", float("inf")), ("readout_s", -0.01)],
 )  # fmt: skip
-def test_impossible_cameras_are_refused_by_name(key: str, value: float) -> None:
+def test_invalid_cameras_are_rejected_naming_the_key(key: str, value: float) -> None:
     with pytest.raises(SettingError) as caught:
         Camera(**{**asdict(PLAIN), key: value})
     assert caught.value.key == key

@@ -48,13 +48,13 @@ def image_centre(pose: Pose) -> FloatArray:
 
 
 @given(poses)
-def test_all_diameters_through_the_true_centre_tell_the_true_distance(pose: Pose) -> None:
+def test_all_diameters_through_the_centre_give_the_distance(pose: Pose) -> None:
     conic = conic_of_circle(pose, RADIUS_M)
     distances = RADIUS_M * circle_distance(image_centre(pose), GAMMAS, conic)
     np.testing.assert_allclose(distances, pose.distance_m, rtol=1e-7)
 
 
-def test_eq_5_as_printed_is_the_distance() -> None:
+def test_the_distance_equals_eq_5_as_printed() -> None:
     theta1, theta2 = 0.031, 0.027
     printed = (
         math.sqrt(2.0)
@@ -75,7 +75,7 @@ def test_eq_5_as_printed_is_the_distance() -> None:
 
 
 @given(poses)
-def test_kim_finds_the_centre_of_concentric_circles(pose: Pose) -> None:
+def test_kim_centre_is_the_projected_centre(pose: Pose) -> None:
     outer, inner = conic_of_circle(pose, RADIUS_M), conic_of_circle(pose, 0.5 * RADIUS_M)
     np.testing.assert_allclose(kim_centre(outer, inner), image_centre(pose), atol=1e-9)
 
@@ -108,7 +108,7 @@ def test_the_closed_form_gives_both_minima_of_the_dispersion(tilt_deg: float) ->
 
 
 @pytest.mark.parametrize("which", [0, 1])
-def test_the_minimisation_ends_at_the_minimum_it_starts_near(which: int) -> None:
+def test_the_minimisation_converges_to_the_nearer_minimum(which: int) -> None:
     conic = conic_of_circle(pose_of(-0.2, 0.1, 15.0, 35.0, 0.5, 0.0), RADIUS_M)
     wanted = circle_planes(conic)[which].image_centre
     radius = ellipse_from_conic(conic).mean_radius
@@ -169,7 +169,7 @@ def test_on_the_optical_axis_the_paper_s_angles_are_those_of_the_table() -> None
 
 
 @given(poses)
-def test_centre_normal_and_one_direction_give_the_whole_pose(pose: Pose) -> None:
+def test_pose_follows_from_plane_and_one_direction(pose: Pose) -> None:
     planes = circle_planes(conic_of_circle(pose, RADIUS_M))
     on_axis = pose.transform(np.array([0.3, 0.0]))
     rebuilt = [pose_on_plane(plane, RADIUS_M, on_axis[:2] / on_axis[2]) for plane in planes]
@@ -178,7 +178,7 @@ def test_centre_normal_and_one_direction_give_the_whole_pose(pose: Pose) -> None
     assert np.linalg.det(best.rotation) == pytest.approx(1.0)
 
 
-def test_conics_go_to_the_plate_and_back() -> None:
+def test_conics_map_to_the_plate_and_back() -> None:
     pose = pose_of(0.15, -0.2, 9.0, 28.0, 4.0, 2.0)
     back = ellipse_from_conic(conic_on_plate(pose, conic_of_circle(pose, 0.21)))
     np.testing.assert_allclose([back.x, back.y, back.a, back.b], [0.0, 0.0, 0.21, 0.21], atol=1e-9)

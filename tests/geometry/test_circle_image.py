@@ -38,7 +38,7 @@ def pixels(plane: FloatArray, i: int) -> FloatArray:
     return CAMERA.project(points.reshape(-1, 3)).reshape(plane.shape)
 
 
-def test_moments_are_those_of_the_area() -> None:
+def test_moments_equal_numerical_integration() -> None:
     """Rings of quadrature nodes over the circle, mapped to pixels by the Jacobian determinant."""
     images = circle_images(CAMERA, circles())
     nodes, weights = np.polynomial.legendre.leggauss(24)
@@ -77,7 +77,7 @@ def test_without_distortion_the_image_is_the_conic() -> None:
     assert split.in_marker_px == pytest.approx(np.zeros((3, 2)), abs=1e-9)
 
 
-def test_eccentricity_is_what_the_formula_says() -> None:
+def test_eccentricity_equals_the_known_formula() -> None:
     """(R²/f) ½ sin 2θ for a small circle on the axis, R its radius in the image."""
     camera = Camera(640, 480, 1000.0, 1000.0, 320.0, 240.0)
     tilt = np.radians(40.0)
@@ -88,7 +88,7 @@ def test_eccentricity_is_what_the_formula_says() -> None:
     assert np.hypot(*split.perspective_px[0]) == pytest.approx(expected, rel=1e-3)
 
 
-def test_split_adds_up() -> None:
+def test_eccentricity_parts_add_up_to_the_total() -> None:
     images, split = circle_images(CAMERA, circles()), eccentricity(CAMERA, circles())
     assert split.centres_px + split.total_px == pytest.approx(images.moments[:, :2], abs=1e-9)
     assert np.abs(split.in_marker_px).max() > 1e-3
@@ -127,7 +127,7 @@ def moved(slopes: CircleDerivatives) -> dict[str, tuple[FloatArray, FloatArray]]
     return pairs
 
 
-def test_derivatives_are_those_of_the_moments() -> None:
+def test_moment_derivatives_equal_finite_differences() -> None:
     slopes = circle_derivatives(CAMERA, circles())
     assert np.array_equal(slopes.moments, circle_images(CAMERA, circles()).moments)
     for name, (analytic, numeric) in moved(slopes).items():
@@ -140,7 +140,7 @@ def test_circles_behind_the_camera_have_no_image() -> None:
     assert np.isnan(circle_images(CAMERA, behind).moments).all()
 
 
-def test_a_circle_endlessly_far_has_no_image() -> None:
+def test_a_circle_extremely_far_away_has_no_image() -> None:
     """Its moments would be those of rounding."""
     far = Circles3D(np.array([[0.0, 0.0, 1e20]]), circles().axes[:1], RADII[:1])
     assert np.isnan(circle_images(CAMERA, far).moments).all()

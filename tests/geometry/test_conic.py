@@ -30,7 +30,7 @@ AROUND = np.linspace(0.0, 2.0 * math.pi, 40, endpoint=False)
 
 
 @given(ellipses)
-def test_an_ellipse_survives_its_matrix(ellipse: Ellipse) -> None:
+def test_conic_matrix_gives_the_ellipse_back(ellipse: Ellipse) -> None:
     back = ellipse_from_conic(ellipse.conic)
     np.testing.assert_allclose([back.a, back.b], [ellipse.a, ellipse.b], rtol=1e-5)
     np.testing.assert_allclose(back.centre, ellipse.centre, atol=1e-4)

@@ -19,7 +19,7 @@ def fitted(edges: np.ndarray, inlying: np.ndarray, most: float = 2.0) -> tuple[n
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 @pytest.mark.parametrize("seed", range(8))
-def test_it_is_the_fit_of_single_ellipses(seed: int, noise: float) -> None:
+def test_fits_equal_those_of_single_ellipses(seed: int, noise: float) -> None:
     rng = np.random.default_rng(seed)
     edges = 1.0 + 0.25 * np.cos(2.0 * (RAYS_RAD - rng.uniform(0.0, 3.0)))
     edges += 0.1 * np.cos(RAYS_RAD - rng.uniform(0.0, 3.0)) + rng.normal(0.0, noise, RAYS)
@@ -39,13 +39,13 @@ def test_a_circle_is_found_to_the_last_digits() -> None:
     np.testing.assert_allclose(found[:4], [0.0, 0.0, 1.1, 1.1], atol=1e-7)
 
 
-def test_too_long_an_ellipse_is_none() -> None:
+def test_ellipses_beyond_the_axis_ratio_are_rejected() -> None:
     edges = 1.0 / np.hypot(np.cos(RAYS_RAD), 2.5 * np.sin(RAYS_RAD))
     found, possible = fitted(edges, np.ones(RAYS, dtype=np.bool_))
     assert not possible
     np.testing.assert_allclose(found[2] / found[3], 2.5, rtol=1e-6)
 
 
-def test_where_no_edge_counts_there_is_none() -> None:
+def test_without_edge_points_no_ellipse_is_fitted() -> None:
     _, possible = fitted(np.ones(RAYS), np.zeros(RAYS, dtype=np.bool_))
     assert not possible

@@ -36,7 +36,7 @@ def there_and_back(module: ModuleType, points: FloatArray) -> tuple[FloatArray, 
     return pixels, back, slopes
 
 
-def test_few_points_are_distorted_without_numba_to_the_same_bits(
+def test_interpreted_distortion_gives_the_same_bits(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     points = np.random.default_rng(1).normal(0.0, 0.5, (40, 2))
@@ -92,7 +92,7 @@ def test_compiled_functions_call_compiled_ones_of_their_own_file_only(
             assert _called(function) & names <= functions.keys(), f"{path}: {name}"
 
 
-def test_only_python_calls_what_adds_in_an_order_of_the_compilers(
+def test_functions_with_reordered_sums_are_called_by_python_only(
     by_file: dict[Path, dict[str, ast.FunctionDef]],
 ) -> None:
     """Else there could be two versions, and a process would get the one that it compiled itself."""

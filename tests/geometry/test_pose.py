@@ -24,7 +24,7 @@ def tilted(rotation_vector_deg: FloatArray, translation_m: FloatArray = AHEAD) -
 
 
 @given(st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3), st.floats(-9.0, 0.0))
-def test_small_and_large_turns_are_scipy_s(vector: list[float], exponent: float) -> None:
+def test_rotation_about_equals_scipy(vector: list[float], exponent: float) -> None:
     turn = 10.0**exponent * np.array(vector)
     np.testing.assert_allclose(
         rotation_about(turn), Rotation.from_rotvec(turn).as_matrix(), atol=1e-13
@@ -77,7 +77,7 @@ def test_a_step_moves_in_metres_and_turns_in_the_camera_frame() -> None:
 
 
 @given(st.floats(-60.0, 60.0), st.floats(-60.0, 60.0), st.floats(-180.0, 180.0))
-def test_the_mirrored_pose_is_as_oblique_and_mirrors_back(x: float, y: float, z: float) -> None:
+def test_mirroring_keeps_the_tilt_and_is_its_own_inverse(x: float, y: float, z: float) -> None:
     translation_m = np.array([2.0, -1.0, 12.0])
     pose = tilted(np.array([x, y, z]), translation_m)
     mirrored = pose.mirrored()
@@ -89,7 +89,7 @@ def test_the_mirrored_pose_is_as_oblique_and_mirrors_back(x: float, y: float, z:
     np.testing.assert_array_equal(mirrored.translation_m, translation_m)
 
 
-def test_a_plate_square_to_its_ray_has_one_pose() -> None:
+def test_a_frontal_plate_is_its_own_mirror_image() -> None:
     pose = Pose(np.eye(3), AHEAD)
     assert pose.mirrored() is pose
 
@@ -128,7 +128,7 @@ def test_a_pose_is_tilted_in_its_own_direction_and_no_less_than_before(tilt_deg:
     np.testing.assert_array_equal(tilted.translation_m, translation_m)
 
 
-def test_a_tilt_across_another_is_square_to_it() -> None:
+def test_tilted_across_is_perpendicular_to_the_tilt() -> None:
     pose = tilted(np.array([4.0, -3.0, 50.0]), np.array([2.0, -1.0, 20.0]))
     across = pose.tilted_across(math.radians(9.0))
     ray = pose.translation_m / pose.distance_m

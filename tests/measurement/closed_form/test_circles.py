@@ -70,7 +70,7 @@ def test_a_circle_that_a_notch_breaks_into_is_found_by_its_hull() -> None:
     )
 
 
-def test_circles_apart_are_apart() -> None:
+def test_distant_circles_are_not_clustered() -> None:
     ellipses = (Ellipse(50.0, 50.0, 20.0, 20.0, 0.0), Ellipse(90.0, 50.0, 10.0, 10.0, 0.0))
     assert len(concentric_clusters(ellipses)) == 2
     assert concentric_clusters(()) == ()

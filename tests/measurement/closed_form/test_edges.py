@@ -62,9 +62,7 @@ def test_edges_outside_the_frame_are_left_out() -> None:
 
 
 @pytest.mark.parametrize("px_per_m", [25.0, 40.0])
-def test_dots_keep_their_angles_to_themselves_on_small_rings(
-    target: Target, px_per_m: float
-) -> None:
+def test_angles_near_dots_are_not_clear_on_small_rings(target: Target, px_per_m: float) -> None:
     clear = clear_of_dots(AROUND, target.ring, 0.9, 30.0, px_per_m)
     degrees = np.degrees(AROUND)
     for dot in target.ring.code_deg:

@@ -35,7 +35,7 @@ def turned_signal(ring: Ring, turn_deg: int) -> np.ndarray[tuple[int, ...], np.d
 
 
 @pytest.mark.parametrize("turn_deg", [0, 1, 77, 180, 359])
-def test_the_lag_is_the_turn_of_the_plate(target: Target, turn_deg: int) -> None:
+def test_the_lag_is_the_heading_of_the_plate(target: Target, turn_deg: int) -> None:
     scores, lags = match_code(40.0 + 90.0 * turned_signal(target.ring, turn_deg)[None], target.ring)
     assert scores[0] == pytest.approx(1.0, abs=1e-9)
     assert (lags[0] - turn_deg + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=0.1)
@@ -120,7 +120,7 @@ def test_a_code_without_a_ring_around_it_is_refused(target: Target) -> None:
         template_match.check(DetectSettings().min_score)
 
 
-def test_disc_and_plate_that_differ_in_shade_only_are_one_target(
+def test_shade_is_accepted_and_unrelated_light_on_disc_and_plate_is_not(
     target: Target, place_plate: PlacePlate, draw_frame: DrawFrame
 ) -> None:
     outer = Ellipse(250.0, 170.0, 40.0, 40.0, 0.0)
@@ -136,7 +136,7 @@ def test_disc_and_plate_that_differ_in_shade_only_are_one_target(
     assert any(math.dist((ring.x, ring.y, ring.a), (250.0, 170.0, 40.0)) < 2.0 for ring in found)
 
 
-def test_a_code_in_view_is_held_against_its_known_heading(
+def test_fixed_lag_score_compares_the_visible_code_at_its_heading(
     target: Target,
     place_plate: PlacePlate,
     draw_frame: DrawFrame,

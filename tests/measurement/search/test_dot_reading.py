@@ -43,7 +43,7 @@ def whole(code_deg: tuple[float, ...]) -> Target:
     turn_deg=st.floats(0.0, 360.0),
     noise_deg=st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4),
 )
-def test_a_code_is_known_at_any_heading(turn_deg: float, noise_deg: list[float]) -> None:
+def test_a_code_is_recognised_at_any_heading(turn_deg: float, noise_deg: list[float]) -> None:
     dots = np.sort((np.array(RING.code_deg) + noise_deg + turn_deg) % 360.0)
     assert align_dots(dots, RING.code_deg, HALF_DEG).is_code
     assert not align_dots(dots, MIRRORED, HALF_DEG).is_code
@@ -77,7 +77,7 @@ def test_a_wrong_code_is_read_from_the_frame(
     assert ("these are its mirror image" in miss.detail) == (code_deg is MIRRORED)
 
 
-def test_dots_are_read_where_they_leave_little_ink_between_them(
+def test_closely_spaced_dots_are_read(
     camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
 ) -> None:
     many = tuple(360.0 / 11.0 * number for number in range(11))
@@ -106,7 +106,7 @@ def test_dirt_darker_than_the_ink_does_not_hide_the_dots(
     np.testing.assert_allclose(read_dots(frame, ellipse, RING), clean, atol=1.0)
 
 
-def test_the_ring_that_has_failed_is_shown_and_not_its_replica(
+def test_the_main_ring_is_described_and_not_its_replica(
     camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
 ) -> None:
     frame = draw_frame((whole((0.0, 50.0, 78.0, 180.0)), place_plate((240.0, 180.0), 90.0)))
@@ -117,7 +117,7 @@ def test_the_ring_that_has_failed_is_shown_and_not_its_replica(
     assert "dots at 0, 50, 78, 180 deg, flight.toml has 0, 43, 78, 180 for A" in miss.detail
 
 
-def test_dots_of_another_ring_of_the_flight_are_known() -> None:
+def test_dots_of_another_ring_of_the_flight_are_recognised() -> None:
     target, other = whole(RING.code_deg), coded((0.0, 90.0, 130.0, 220.0), "B")
     for code_deg, text in (
         (INNER, "for A: these are those of its replica A-inner"),
@@ -129,7 +129,7 @@ def test_dots_of_another_ring_of_the_flight_are_known() -> None:
         assert described.endswith(text)
 
 
-def test_expected_dots_none_and_a_texture_say_nothing() -> None:
+def test_expected_dots_no_dots_and_textures_are_not_described() -> None:
     target = whole(RING.code_deg)
     for dots in (np.array(RING.code_deg), np.empty(0), np.arange(0.0, 360.0, 30.0)):
         assert describe_dots(dots, target.ring, target, (target,)) is None

@@ -88,7 +88,7 @@ def frame_of_ellipses(seed: int) -> tuple[GreyArray, FloatArray, FloatArray]:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_edges_are_those_of_the_plain_version(seed: int) -> None:
+def test_edges_equal_those_of_a_plain_implementation(seed: int) -> None:
     grey, centres, radii = frame_of_ellipses(seed)
     pyramid = build_pyramid(grey)
     edges, inlying = track_edges(pyramid.frame, pyramid.reduced, pyramid.levels, centres, radii)

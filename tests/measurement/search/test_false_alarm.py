@@ -63,7 +63,7 @@ def test_a_higher_score_is_less_likely_and_blur_makes_it_more_so(
         assert chance <= false_code_probability(score, MAIN, 1.2 * blur_rad)
 
 
-def test_the_limit_is_on_the_chance_per_frame() -> None:
+def test_the_limit_is_on_the_probability_per_frame() -> None:
     chance = CHANCE_RINGS_PER_FRAME * false_code_probability(
         0.95, MAIN, 0.8 / (12.0 * 0.642857143 / 0.9)
     )
@@ -73,6 +73,6 @@ def test_the_limit_is_on_the_chance_per_frame() -> None:
     assert caught.value.reason is Reason.CODE_MISMATCH
 
 
-def test_without_a_blur_nothing_is_known_of_chance() -> None:
+def test_without_a_blur_no_code_is_rejected() -> None:
     appearance = replace(OBSERVATION.appearance, blur_px=None)
     check_false_alarm(replace(OBSERVATION, score=0.1, appearance=appearance), TARGET, MAIN, 1e-12)

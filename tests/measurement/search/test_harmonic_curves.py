@@ -39,7 +39,7 @@ def fitted(
 
 
 @pytest.mark.parametrize(("rays", "count"), [(20, 1), (20, 64), (20, 150), (40, 65)])
-def test_each_curve_is_that_of_weighted_least_squares(rays: int, count: int) -> None:
+def test_each_curve_equals_weighted_least_squares(rays: int, count: int) -> None:
     rng = np.random.default_rng(rays + count)
     edges = 1.0 + 0.1 * rng.normal(size=(rays, count))
     strengths = rng.integers(0, 256, (rays, count)).astype(np.uint8)
@@ -70,19 +70,19 @@ def test_a_third_of_wrong_edges_hardly_moves_a_curve() -> None:
     assert np.mean(off < 0.05) >= 0.9
 
 
-def test_no_curves_are_no_error() -> None:
+def test_zero_curves_are_accepted() -> None:
     curves, residuals = fitted(np.empty((20, 0)), np.empty((20, 0), np.uint8))
     assert curves.shape == (TERMS, 0)
     assert residuals.shape == (20, 0)
 
 
-def test_edges_without_strength_leave_the_ridge_alone() -> None:
+def test_edges_of_zero_strength_give_a_zero_curve() -> None:
     curves, _ = fitted(np.full((20, 3), 1.1), np.zeros((20, 3), np.uint8))
     np.testing.assert_allclose(curves, 0.0, atol=1e-12)
 
 
 @given(arrays.arrays(np.uint8, st.tuples(st.sampled_from((2, 20, 40)), st.integers(1, 70))))
-def test_medians_are_numpys(values: GreyArray) -> None:
+def test_medians_equal_numpy(values: GreyArray) -> None:
     medians = np.empty(values.shape[1])
     fill_in_medians(values, medians)
     np.testing.assert_array_equal(medians, np.median(values, axis=0))

@@ -52,7 +52,7 @@ def test_an_outline_gives_a_pose_to_a_per_cent_or_two(
 
 
 @pytest.mark.parametrize("off_px", [(1.5, -1.0, 0.0, 0.0), (-0.5, 0.5, 2.0, -1.0)])
-def test_an_outline_from_a_reduced_image_is_mended_in_the_frame(
+def test_a_large_outline_is_refined_in_the_frame(
     off_px: tuple[float, float, float, float],
     camera: Camera,
     target: Target,
@@ -80,21 +80,21 @@ def pose_row(camera: Camera, pose: Pose) -> float:
 
 
 @pytest.mark.parametrize("blur_px", [0.8, 3.0])
-def test_it_sees_how_blurred_edges_are(
+def test_initial_blur_follows_the_image(
     blur_px: float, started: Callable[..., tuple[InitialPose, Pose]]
 ) -> None:
     seen, _ = started(50.0, 15.0, blur_px=blur_px)
     assert 0.8 * blur_px < seen.blur_px < 1.5 * blur_px
 
 
-def test_it_sees_light_that_spills_over_the_edges(
+def test_initial_edge_shift_follows_the_image(
     started: Callable[..., tuple[InitialPose, Pose]],
 ) -> None:
     seen, _ = started(40.0, 10.0, white=3.0, blur_px=1.2)
     assert 0.4 < (seen.edge_shift_px) < 2.0
 
 
-def test_no_start_is_square_to_its_ray(
+def test_no_start_is_frontal(
     started: Callable[..., tuple[InitialPose, Pose]],
 ) -> None:
     seen, _ = started(14.0, 0.0)

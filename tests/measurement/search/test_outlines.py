@@ -49,7 +49,7 @@ def test_reduced_images_show_what_the_frame_shows(
 
 
 @pytest.mark.parametrize("radius", [6.0, 7.1, 9.3, 12.0, 16.0, 23.0, 31.0, 44.0, 60.0, 88.0])
-def test_a_ring_of_any_size_is_seeded_and_followed(radius: float) -> None:
+def test_rings_of_any_size_are_found_and_tracked(radius: float) -> None:
     centre = (141.3, 103.8)
     pyramid = build_pyramid(ring_frame(centre, (radius, radius)))
     seeds = find_seeds(pyramid, 6.0)

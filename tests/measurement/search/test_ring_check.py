@@ -110,7 +110,7 @@ def frame_of_rings(seed: int, typical_px: float) -> tuple[GreyArray, FloatArray]
 
 @pytest.mark.parametrize("level", range(6))
 @pytest.mark.parametrize("seed", range(3))
-def test_rings_are_those_of_the_definition(level: int, seed: int) -> None:
+def test_rings_equal_those_of_a_plain_implementation(level: int, seed: int) -> None:
     factor = reduction_factor(level)
     frame, centres = frame_of_rings(seed, 0.9 * PEAK_RADIUS_PX * factor)
     pyramid = build_pyramid(frame)

@@ -57,7 +57,7 @@ def _sums(values: np.ndarray, size: int) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("shape", [(97, 131), (29, 1015), (27, 1017), (23, 2050), (6, 7)])
-def test_peaks_are_those_of_the_definition(shape: tuple[int, int], seed: int) -> None:
+def test_peaks_equal_those_of_a_plain_implementation(shape: tuple[int, int], seed: int) -> None:
     rng = np.random.default_rng(seed)
     smooth = (0.7, 1.1, 1.4)[seed]
     image = ndimage.gaussian_filter(rng.normal(120.0, 140.0 * smooth, shape), smooth)
@@ -70,7 +70,7 @@ def test_peaks_are_those_of_the_definition(shape: tuple[int, int], seed: int) ->
     np.testing.assert_allclose(peaks, expected, rtol=0.0, atol=1e-9)
 
 
-def test_the_answer_to_a_ring_by_its_radius_is_that_of_the_documentation() -> None:
+def test_the_response_by_radius_is_that_in_the_docs() -> None:
     """As a share of its contrast; sampled 20 times per pixel, blurred by 0.6 px."""
     size, fine = 31, 20
     y, x = (np.mgrid[: size * fine, : size * fine] + 0.5) / fine - 0.5 * size

@@ -36,7 +36,7 @@ def defined_score(
 
 @pytest.mark.parametrize("hidden", [0, 1, 37, 55])
 @pytest.mark.parametrize("shape", [(3, 4, 48, 6), (1, 1, 60, 1), (2, 5, 30, 3)])
-def test_scores_are_those_of_the_definition(shape: tuple[int, ...], hidden: int) -> None:
+def test_scores_equal_the_definition(shape: tuple[int, ...], hidden: int) -> None:
     count, rows, angles, shifts = shape
     rng = np.random.default_rng(hidden + angles)
     spectrum = rng.normal(size=(count, rows, 12)) + 1j * rng.normal(size=(count, rows, 12))
@@ -54,7 +54,7 @@ def test_scores_are_those_of_the_definition(shape: tuple[int, ...], hidden: int)
     np.testing.assert_allclose(scores, expected, rtol=0.0, atol=2e-6)
 
 
-def test_the_unmasked_scores_are_those_of_a_mask_that_hides_nothing(target: Target) -> None:
+def test_unmasked_scores_equal_those_with_everything_visible(target: Target) -> None:
     templates = templates_of(target.ring)
     patch = some_light(len(templates.weights) + 2 * SHIFTS, 5)
     masked = correlate(patch, templates, np.ones(ANGLES, dtype=bool))
@@ -62,7 +62,7 @@ def test_the_unmasked_scores_are_those_of_a_mask_that_hides_nothing(target: Targ
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_best_template_is_the_best_of_all_turns_and_shifts(target: Target, seed: int) -> None:
+def test_best_placement_is_the_maximum_over_lags_and_shifts(target: Target, seed: int) -> None:
     templates = templates_of(target.ring)
     rng = np.random.default_rng(seed)
     index, shift, lag = (int(rng.integers(n)) for n in (len(templates.images), 9, ANGLES))
@@ -125,7 +125,7 @@ def test_along_the_code_circle_a_code_is_told_from_stripes(target: Target, turn:
 
 
 @pytest.mark.parametrize("hidden", [0, 6, 60])
-def test_nothing_hidden_little_and_too_much_are_no_part(target: Target, hidden: int) -> None:
+def test_visible_angles_need_a_hidden_part_of_moderate_size(target: Target, hidden: int) -> None:
     seen = 20.0 + 150.0 * templates_of(target.ring).images[3]
     seen[:, :hidden] = 60.0
     assert visible_angles(seen, target.ring) is None

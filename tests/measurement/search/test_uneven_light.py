@@ -34,7 +34,7 @@ def test_even_light_is_left_as_it_is(target: Target) -> None:
     )
 
 
-def test_a_ring_half_in_shade_is_clear(target: Target) -> None:
+def test_a_ring_half_in_shade_matches_clearly(target: Target) -> None:
     patch = patch_of(target.ring, half_in_shade())
     even = light_corrected_patch(patch, target.ring, SHIFTS)
     assert even is not None
@@ -43,7 +43,7 @@ def test_a_ring_half_in_shade_is_clear(target: Target) -> None:
     assert template_match.lag_deg == pytest.approx(TURN * 360.0 / ANGLES, abs=3.1)
 
 
-def test_a_highlight_beside_a_ring_is_made_even(target: Target) -> None:
+def test_a_highlight_on_a_ring_is_corrected(target: Target) -> None:
     added = 90.0 * np.exp(-0.5 * ((ANGLES_RAD - 2.0) / 0.8) ** 2)
     assert match_templates(
         patch_of(target.ring, np.ones(ANGLES), added), target.ring, 40.0
@@ -63,7 +63,7 @@ def test_small_rings_are_taken_to_be_in_even_light(target: Target) -> None:
 
 
 @pytest.mark.parametrize(("rank", "half"), [(7, 10), (5, 5), (0, 3)])
-def test_levels_are_those_of_a_rank_among_neighbours_smoothed(rank: int, half: int) -> None:
+def test_smooth_levels_are_smoothed_rank_filters(rank: int, half: int) -> None:
     circles = np.random.default_rng(half).integers(0, 9, (2, ANGLES)).astype(float)
     turned = [np.roll(circles, step, axis=1) for step in range(-half, half + 1)]
     ranked = np.sort(turned, axis=0)[rank]
