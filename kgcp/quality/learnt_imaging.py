@@ -20,9 +20,9 @@ from kgcp.measurement.adjustment.smoothing import CameraSmoothing, camera_smooth
 from kgcp.measurement.image_model.photometry import (
     Light,
     Tone,
+    apply_tone_uncompiled,
     decoded,
     encoded,
-    toned_between,
 )
 from kgcp.measurement.records import FrameResult, Imaging, Measurement, ToneBase
 
@@ -220,7 +220,7 @@ def _light_of_grey(imaging: Imaging, grey: FloatArray) -> FloatArray:
     share = np.linspace(0.0, 1.0, 4 * _STEPS + 1)
     tone_1, tone_2, tone_3 = imaging.tone
     light = Light(imaging.black, imaging.white, tone_1=tone_1, tone_2=tone_2, tone_3=tone_3)
-    toned = toned_between(share, light)
+    toned = apply_tone_uncompiled(share, light)
     levels = np.maximum.accumulate(encoded(toned, TONE_OF_BASE[imaging.base]))
     return np.interp(grey, levels, share, left=np.nan, right=np.nan)
 

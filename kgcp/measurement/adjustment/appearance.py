@@ -13,17 +13,17 @@ from kgcp.measurement.adjustment.solver import TargetFit, noise_of
 from kgcp.measurement.image_model.blur import variance_in_pixels
 from kgcp.measurement.image_model.photometry import (
     Tone,
+    apply_tone,
     encoded,
     plateau_levels,
-    share_at,
-    share_before_edge_tone,
-    toned,
+    share_at_level,
+    undo_edge_tone,
 )
 from kgcp.measurement.image_model.window import contour_px, semi_major_axis_px
 from kgcp.measurement.records import Appearance, Imaging, ToneBase
 from kgcp.targets.layout import Target
 
-TONE_OF_BASE = {ToneBase.SRGB: Tone.UNKNOWN, ToneBase.LINE: Tone.UNKNOWN_FROM_LINE}
+TONE_OF_BASE = {ToneBase.SRGB: Tone.UNKNOWN, ToneBase.LINE: Tone.UNKNOWN_OVER_LINE}
 """The tone of a fit, by the base of its tone curve."""
 _BASE_OF_TONE = {tone: base for base, tone in TONE_OF_BASE.items()}
 _NEAR_EDGE = 0.3  # pixels near an edge have a white share of 0.5 ± this
@@ -77,18 +77,18 @@ def places_across_edges_px(fit: TargetFit, level: float | None) -> FloatArray:
     if field is None:
         black, white = plateau_levels(light, tone)
         wanted = 0.5 * (black + min(white, high)) if level is None else level
-        shares = np.array([share_at(wanted, light, tone)])
+        shares = np.array([share_at_level(wanted, light, tone)])
     else:
         off = np.abs(fit.prediction.share - 0.5)
         near = off <= max(_NEAR_EDGE, float(off.min()))
         ink, plate = np.array([[0.0], [1.0]]) + field.added(fit.sample.pixels[:, near])
         lights = np.linspace(float(ink.min()), float(plate.max()), _CURVE_POINTS)
-        rising = np.maximum.accumulate(encoded(toned(lights, light.values), tone))
+        rising = np.maximum.accumulate(encoded(apply_tone(lights, light.values), tone))
         dark, bright = (np.interp(side, lights, rising) for side in (ink, plate))
         midway = 0.5 * (dark + np.minimum(bright, high))
         reached = np.interp(midway if level is None else level, rising, lights)
         bent = (reached - ink) / np.maximum(plate - ink, _LEAST_CONTRAST)
-        shares = share_before_edge_tone(np.clip(bent, 0.0, 1.0), light)
+        shares = undo_edge_tone(np.clip(bent, 0.0, 1.0), light)
     shares = np.clip(shares, _LEAST_SHARE, 1.0 - _LEAST_SHARE)
     return np.asarray(fit.parameters.blur.mean_sd_px * ndtri(shares))
 

@@ -264,7 +264,7 @@ def common_displacement_px(fit: TargetFit, share_along_arcs: float) -> float:
     """
     problem, light = fit.sample.problem, fit.parameters.light
     is_even = fit.level_equations is None
-    if problem.tone is Tone.OF_BINS:
+    if problem.tone is Tone.BINNED:
         floor_px = _EDGE_FLOOR_OF_BINS_PX / problem.window.binning
     else:
         floor_px = _EDGE_FLOOR_PX if is_even else _halo_displacement_px(light)

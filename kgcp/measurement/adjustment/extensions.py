@@ -58,10 +58,10 @@ from kgcp.measurement.image_model.photometry import (
     Param,
     Tone,
     decoded,
-    light_over,
+    light_over_base,
 )
-from kgcp.measurement.image_model.seen_shadows import SeenShadows
 from kgcp.measurement.image_model.shadow_edges import INK
+from kgcp.measurement.image_model.shadow_search import FoundShadows
 from kgcp.measurement.records import ToneBase
 
 _NUDGE = 1e-6  # start value of skew and kurtosis: at 0, their derivatives would be left out
@@ -299,7 +299,7 @@ def _best_in_any_light(
         varying = _with_edge_tone(problem, _fit_over_other_base(problem, start))
     elif plateaus is None or not plateaus.is_uneven:
         # the one tone parameter of bins holds only for the levels that it was fitted with
-        seen = None if problem.tone is Tone.OF_BINS else plateaus
+        seen = None if problem.tone is Tone.BINNED else plateaus
         varying = _with_edge_tone(problem, _with_varying_levels(problem, plain, seen))
     else:
         varying = _fit_from_plateaus(problem, pose, blur, plateaus)
@@ -339,7 +339,7 @@ def _fit_over_other_base(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
     The worse pose is not adjusted.
     """
     first = poses.best.parameters
-    light = light_over(first.light, poses.best.sample.problem.tone, problem.tone)
+    light = light_over_base(first.light, poses.best.sample.problem.tone, problem.tone)
     start = replace(Parameters.of(first.pose, first.blur, light), field=first.field)
     best = fit_levels(problem, [start], poses.best.unknowns)
     return TwoPoses(best, moved_to(best, poses.other.parameters.pose))
@@ -453,7 +453,7 @@ def _with_varying_levels(
     return _fit_varying_levels(problem, poses, [*edged, smooth])
 
 
-def _under_shadows(problem: FitProblem, first: Parameters, seen: SeenShadows) -> Parameters:
+def _under_shadows(problem: FitProblem, first: Parameters, seen: FoundShadows) -> Parameters:
     """Return the start with straight edges of shadows across the plate."""
     rows = seen.edges.rows.copy()
     # the second edge of a strip of shadow adds back what the first one takes

@@ -96,7 +96,7 @@ def measure_by_model(
     outlined_px = _outlined_radius_px(start, target)
     pose = _without_edge_shift(start, outlined_px)
     problem = fit_problem_of(grey, camera, target, pose, prior.rotation)
-    may_be_finer = problem.tone is Tone.OF_BINS  # other bins are as good as single pixels
+    may_be_finer = problem.tone is Tone.BINNED  # other bins are as good as single pixels
     problem = replace(problem, visible=visible, may_be_finer=may_be_finer)
     blur = _start_blur(start.blur_px, outlined_px, problem.window.binning)
     try:

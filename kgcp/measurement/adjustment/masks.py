@@ -78,7 +78,7 @@ def see_plate(problem: FitProblem, pose: Pose, blur: Blur, slack_px: float = 0.0
         problem.measured_count,
         pose,
         rays,
-        small_m=_SMALL_SIGMAS * sd_px * scale,
+        small_radius_m=_SMALL_SIGMAS * sd_px * scale,
         reach_m=reach_px * scale,
         spread=spread,
     )
@@ -102,7 +102,7 @@ def first_levels(problem: FitProblem, pose: Pose) -> Light:
     circles, count = problem.circles, problem.measured_count
     unblurred = unblurred_plate(circles, count, pose, rays, reach_m=outer_m - inner_m)
     black, white = _median_levels(
-        levels, unblurred.rho_m, unblurred.share, unblurred.off_edge_m, outer_m
+        levels, unblurred.rho_m, unblurred.share, unblurred.edge_distance_m, outer_m
     )
     if not white - black >= 4.0 * window.levels_per_count:
         raise Rejection(Reason.NO_CONTRAST, f"ink {black:.3f}, plate {white:.3f}")
@@ -122,7 +122,7 @@ def _median_levels(
     levels: FloatArray,
     rho_m: FloatArray,
     share: FloatArray,
-    off_edge_m: FloatArray,
+    edge_distance_m: FloatArray,
     radius_m: float,
 ) -> tuple[float, float]:
     """Return the levels of ink and plate within a radius, as medians of pixels clear of edges."""
@@ -130,19 +130,19 @@ def _median_levels(
     for i in range(len(levels)):
         if rho_m[i] < radius_m:
             kind = 0 if share[i] < 0.5 else 1
-            seen[kind, count[kind]], off[kind, count[kind]] = levels[i], off_edge_m[i]
+            seen[kind, count[kind]], off[kind, count[kind]] = levels[i], edge_distance_m[i]
             count[kind] += 1
     ink = _median_of_clearest(seen[0, : count[0]], off[0, : count[0]])
     return ink, _median_of_clearest(seen[1, : count[1]], off[1, : count[1]])
 
 
 @compiled
-def _median_of_clearest(levels: FloatArray, off_edge_m: FloatArray) -> float:
+def _median_of_clearest(levels: FloatArray, edge_distance_m: FloatArray) -> float:
     """Return the median of the levels that are farthest from edges; NaN without any."""
     if len(levels) == 0:
         return np.nan
     first = int(_BLURRED_SHARE * len(levels))
-    return float(np.median(levels[off_edge_m >= np.partition(off_edge_m, first)[first]]))
+    return float(np.median(levels[edge_distance_m >= np.partition(edge_distance_m, first)[first]]))
 
 
 def background_mask(seen: SeenPlate, light: Light, slack_px: float = 0.0) -> BoolArray:
@@ -238,7 +238,7 @@ def occluded_mask(seen: SeenPlate, light: Light, slack_px: float) -> BoolArray:
     hidden_count, tested_count = _mark_hidden(
         problem.window.smooth,
         unblurred.share,
-        unblurred.off_edge_m,
+        unblurred.edge_distance_m,
         unblurred.rho_m,
         black,
         contrast,
@@ -282,7 +282,7 @@ def _without_dots(seen: SeenPlate, hidden: BoolArray) -> BoolArray:
 def _mark_hidden(
     smooth: FloatArray,
     share: FloatArray,
-    off_edge_m: FloatArray,
+    edge_distance_m: FloatArray,
     rho_m: FloatArray,
     black: float,
     contrast: float,
@@ -300,7 +300,7 @@ def _mark_hidden(
     """
     hidden_count = tested_count = 0
     for i in range(len(smooth)):
-        off_m, beyond_m = off_edge_m[i] - slack_m, rho_m[i] - outer_radius_m - slack_m
+        off_m, beyond_m = edge_distance_m[i] - slack_m, rho_m[i] - outer_radius_m - slack_m
         is_clear = off_m > _CLEAR_SIGMAS * sd_m and beyond_m < 0.0
         is_near = off_m > _NO_EDGE_SIGMAS * sd_m and beyond_m < _NO_EDGE_OUTSIDE_SIGMAS * sd_m
         tested_count += is_clear or is_near

@@ -25,7 +25,7 @@ from kgcp.measurement.image_model.blur import (
     find_edge_incidence,
     reach_px,
 )
-from kgcp.measurement.image_model.blurred_plate import white_share_only
+from kgcp.measurement.image_model.blurred_plate import white_share_without_derivatives
 from kgcp.measurement.image_model.noise import Censoring
 from kgcp.measurement.image_model.photometry import (
     PLAIN_COUNT,
@@ -171,7 +171,7 @@ def _useful_pixels(
     index = np.empty(len(unused), dtype=np.intp)
     count = _fill_in_pixels(
         seen.unblurred.rho_m,
-        seen.unblurred.off_measured_m,
+        seen.unblurred.measured_edge_distance_m,
         unused,
         (near_sigmas * sd_px + _NEAR_PX) * scale,
         tail_m,
@@ -194,7 +194,7 @@ def _unmeasured_m(seen: SeenPlate) -> float:
 @compiled
 def _fill_in_pixels(
     rho_m: FloatArray,
-    off_edge_m: FloatArray,
+    edge_distance_m: FloatArray,
     unused: BoolArray,
     near_m: float,
     tail_m: float,
@@ -206,14 +206,14 @@ def _fill_in_pixels(
     """Fill in all pixels near edges, and some of those clear of all edges; return how many."""
     flat = 0
     for i in range(len(rho_m)):
-        is_flat = off_edge_m[i] >= tail_m and unmeasured_m <= rho_m[i] < limit_m
+        is_flat = edge_distance_m[i] >= tail_m and unmeasured_m <= rho_m[i] < limit_m
         flat += is_flat and not unused[i]
     step, number, count = max(1, flat // plateau_pixels), 0, 0
     for i in range(len(rho_m)):
         if unused[i] or rho_m[i] >= limit_m:
             continue
-        is_used = off_edge_m[i] < near_m
-        if off_edge_m[i] >= tail_m and rho_m[i] >= unmeasured_m:
+        is_used = edge_distance_m[i] < near_m
+        if edge_distance_m[i] >= tail_m and rho_m[i] >= unmeasured_m:
             is_used = number % step == 0
             number += 1
         if is_used:
@@ -249,14 +249,14 @@ def _white_share_shown(seen: SeenPlate, pose: Pose, light: Light, index: IndexAr
     Pixels of `index`, which are adjusted, have their share without blur.
     """
     problem, scale, shown = seen.problem, seen.metres_per_px, seen.unblurred.share.copy()
-    is_other = seen.unblurred.off_edge_m < REACH_SIGMAS * seen.blur.largest_sd_px * scale
+    is_other = seen.unblurred.edge_distance_m < REACH_SIGMAS * seen.blur.largest_sd_px * scale
     is_other[index] = False
     others = np.flatnonzero(is_other)
     rays, points_m = (
         np.take(a, others, axis=1) for a in (problem.window.rays, seen.unblurred.points_m)
     )
     incidence = find_edge_incidence(points_m, scale, problem.circles, seen.blur, seen.spread)
-    share = white_share_only(pose.matrix, rays, seen.blur.vector, incidence).value
+    share = white_share_without_derivatives(pose.matrix, rays, seen.blur.vector, incidence).value
     even = PhotometricModel(np.zeros((2, len(others))), problem.tone, None)
     black, white = plateau_levels(light, problem.tone)
     shown[others] = (even.levels(share, light) - black) / (white - black)
@@ -275,5 +275,5 @@ def _edge_incidence(
         return incidence
     others = problem.circles.part(slice(problem.measured_count, None))
     replicas = find_edge_incidence(points_m, scale, others, blur, seen.spread)
-    added = white_share_only(pose.matrix, rays, blur.vector, replicas).value - 1.0
+    added = white_share_without_derivatives(pose.matrix, rays, blur.vector, replicas).value - 1.0
     return replace(incidence, background=incidence.background + added)

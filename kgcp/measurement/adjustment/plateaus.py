@@ -13,7 +13,7 @@ from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.image_model.light_field import LightField
 from kgcp.measurement.image_model.photometry import Light, decoded
-from kgcp.measurement.image_model.seen_shadows import FlatPixels, SeenShadows, find_shadows
+from kgcp.measurement.image_model.shadow_search import FoundShadows, PlateauPixels, find_shadows
 from kgcp.measurement.image_model.unblurred import UnblurredPlate, unblurred_plate
 
 # Tuning, by the flights `light` of `benchmarks.accuracy.evaluate`. Where nothing else is said,
@@ -131,7 +131,7 @@ def _clear_of_edges(problem: FitProblem, unblurred: UnblurredPlate, sd_px: float
         turns = np.arctan2(unblurred.points_m[1], unblurred.points_m[0]) / (2.0 * math.pi)
         count = len(problem.visible)
         within &= problem.visible[np.rint(turns * count).astype(np.intp) % count]
-    return np.asarray(within & (unblurred.off_edge_m >= clear_px / px_per_m))
+    return np.asarray(within & (unblurred.edge_distance_m >= clear_px / px_per_m))
 
 
 def _kinds(
@@ -223,12 +223,12 @@ def field_of(
     return replace(field, values=values, offsets=offsets)
 
 
-def shadows_across(problem: FitProblem, plateaus: Plateaus) -> list[SeenShadows]:
+def shadows_across(problem: FitProblem, plateaus: Plateaus) -> list[FoundShadows]:
     """Return straight edges of shadows that explain how the levels vary, the fewest first."""
     step = max(1, sum(map(len, plateaus.flat)) // _MOST_PIXELS)
     chosen = [flat[::step] for flat in plateaus.flat]
     index = np.concatenate(chosen)
-    flat = FlatPixels(
+    flat = PlateauPixels(
         offsets=problem.window.pixels(index) - problem.centre_px[:, None],
         kind=np.repeat((0, 1), [len(each) for each in chosen]),
         levels=problem.window.smooth[index],

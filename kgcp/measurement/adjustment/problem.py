@@ -105,4 +105,4 @@ def apparent_tone(response: Response, window: Window, radius_px: float) -> Tone:
             return Tone.NEAR_SRGB
         return Tone.of(response)
     is_clipped = float(np.mean(window.clipped)) > _CLIPPED
-    return Tone.LINEAR if response is Response.LINEAR and not is_clipped else Tone.OF_BINS
+    return Tone.LINEAR if response is Response.LINEAR and not is_clipped else Tone.BINNED

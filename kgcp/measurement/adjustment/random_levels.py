@@ -45,16 +45,16 @@ from kgcp.measurement.image_model.light_field import (
     LEVEL_OFFSET_PRECISION,
     SPAN,
     LightField,
-    knots_over,
+    lay_knots,
 )
 from kgcp.measurement.image_model.noise import Misfit
 from kgcp.measurement.image_model.photometry import (
     PARAM_COUNT,
     Param,
+    apply_tone,
     encoded,
     light_after_step,
     plateau_levels,
-    toned,
 )
 from kgcp.measurement.image_model.shadow_edges import NO_EDGES
 
@@ -113,7 +113,7 @@ def even_field(problem: FitProblem) -> LightField:
     radius, window = problem.outer_radius_px, problem.window
     fine, coarse = max(_FINEST_PX, radius / _FINE), _COARSE * radius
     spacings_px = (coarse, fine) if coarse > 1.5 * fine else (fine,)
-    knots = knots_over(
+    knots = lay_knots(
         (window.x0, window.x0 + window.width - 1),
         (window.y0, window.y0 + window.height - 1),
         problem.centre_px,
@@ -242,7 +242,9 @@ def _evened(problem: FitProblem, parameters: Parameters) -> FitProblem:
     added = field.added(window.pixels(np.arange(len(window.levels))))
     light = parameters.light
     black, white = plateau_levels(light, problem.tone)
-    ink, plate = (encoded(toned(x, light.values), problem.tone) for x in (added[0], 1.0 + added[1]))
+    ink, plate = (
+        encoded(apply_tone(x, light.values), problem.tone) for x in (added[0], 1.0 + added[1])
+    )
     white, plate = min(white, problem.brightest), np.minimum(plate, problem.brightest)
     contrast = np.maximum(plate - ink, _LEAST_CONTRAST * (white - black))
     smooth = black + (window.smooth - ink) * (white - black) / contrast

@@ -73,7 +73,7 @@ def residual_image_of(
     fit = adjust_with_streak(problem, start, moves_pose=False)
     # the test for uneven light needs the covariance of the pose: as if the pose were free
     if needs_varying_levels(replace(fit, unknowns=with_pose(fit.unknowns))):
-        is_binned = problem.tone is Tone.OF_BINS
+        is_binned = problem.tone is Tone.BINNED
         if is_binned:  # as in a measurement
             problem = finer_problem_of(grey, camera, target, pose)
         blur = _blur_in_bins(blur_px, problem)

@@ -22,7 +22,7 @@ from kgcp.measurement.adjustment.covariance import propagate, unevenness_factor
 from kgcp.measurement.adjustment.normal_equations import normal_matrix
 from kgcp.measurement.adjustment.solver import TargetFit
 from kgcp.measurement.image_model.edge_terms import smoothing_row
-from kgcp.measurement.image_model.ray_plate import views_of
+from kgcp.measurement.image_model.ray_plate import plate_views
 from kgcp.measurement.records import ContourSmoothing, Measurement
 
 # In eight flights rendered by other programs, the smoothing had means of −0.07 to 0.09 px², with
@@ -65,7 +65,7 @@ def contour_smoothing(fit: TargetFit, inflation: float) -> ContourSmoothing | No
 def _by_smoothing(fit: TargetFit) -> FloatArray:
     """Return the derivative (n,) of the grey values by smoothing along contours."""
     sample, parameters, share = fit.sample, fit.parameters, fit.prediction.share
-    views = views_of(parameters.matrix, sample.rays)
+    views = plate_views(parameters.matrix, sample.rays)
     row = smoothing_row(views, parameters.blur.total_covariance, sample.incidence)
     field = parameters.field
     added = None if field is None else field.added(sample.pixels)

@@ -24,7 +24,7 @@ from kgcp.measurement.image_model.blurred_plate import (
     WhiteShare,
     kurtosis_row,
     white_share,
-    white_share_only,
+    white_share_without_derivatives,
 )
 from kgcp.measurement.image_model.edge_terms import skew_rows, spread_share_gradient
 from kgcp.measurement.image_model.noise import GreyNoise, Misfit, estimate_noise, misfit
@@ -97,7 +97,7 @@ def moved_to(fit: TargetFit, pose: Pose) -> TargetFit:
 
 def predict(sample: Sample, parameters: Parameters) -> PredictedImage:
     """Model the grey values of a sample."""
-    share = white_share_only(
+    share = white_share_without_derivatives(
         parameters.matrix, sample.rays, parameters.blur.vector, sample.incidence
     )
     share, added = _with_edge_terms(share, sample, parameters)

@@ -12,7 +12,7 @@ from kgcp.measurement.adjustment.solver import TargetFit
 from kgcp.measurement.image_model.blurred_plate import kurtosis_row
 from kgcp.measurement.image_model.edge_terms import skew_rows
 from kgcp.measurement.image_model.photometry import SHAPE_PARAMS, SKEW_PARAMS, Param
-from kgcp.measurement.image_model.ray_plate import views_of
+from kgcp.measurement.image_model.ray_plate import plate_views
 
 _SKEW_SD_PX3 = 1.0  # of third cumulants: a skewness of 0.6 for a spread of σ = 1.2 px
 # Defocus alone has an excess kurtosis of −1; with a pixel and a lens's own blur it is −0.4 to −0.7.
@@ -92,7 +92,7 @@ def equations_by_shape(fit: TargetFit, scaled: FloatArray, normal: FloatArray) -
 def _by_shape(fit: TargetFit) -> FloatArray:
     """Return the derivatives (5, n) of the grey values by skew and kurtosis."""
     sample, parameters, share = fit.sample, fit.parameters, fit.prediction.share
-    views, blur = views_of(parameters.matrix, sample.rays), parameters.blur
+    views, blur = plate_views(parameters.matrix, sample.rays), parameters.blur
     skew = skew_rows(views, blur.total_covariance, sample.incidence)
     kurtosis = kurtosis_row(share, parameters.matrix, sample.rays, blur.vector, sample.incidence)
     rows = np.vstack((skew, kurtosis))

@@ -57,8 +57,8 @@ _OF_TONE = {
     Tone.SRGB: [Param.SHARPENING],
     Tone.NEAR_SRGB: [*_TONE, Param.SHARPENING],
     Tone.UNKNOWN: [*_SHAPED, Param.LINEAR_SHARPENING],
-    Tone.UNKNOWN_FROM_LINE: _SHAPED,
-    Tone.OF_BINS: [Param.TONE_1],  # takes how far a tone curve displaces edges within bins
+    Tone.UNKNOWN_OVER_LINE: _SHAPED,
+    Tone.BINNED: [Param.TONE_1],  # takes how far a tone curve displaces edges within bins
 }
 
 

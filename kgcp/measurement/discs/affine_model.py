@@ -22,9 +22,9 @@ from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.image_model.blur import REACH_SIGMAS, Blur
 from kgcp.measurement.image_model.blurred_discs import render
-from kgcp.measurement.image_model.blurred_plate import KURTOSIS_SPREAD, WhiteShare
+from kgcp.measurement.image_model.blurred_plate import KURTOSIS_STEP, WhiteShare
 from kgcp.measurement.image_model.quadrature import quadrature_for
-from kgcp.measurement.image_model.ray_plate import PLATE_ROWS, SLOPE_ROWS
+from kgcp.measurement.image_model.ray_plate import JACOBIAN_ROWS, PLATE_ROWS
 
 _VIEW_ROWS = 6
 _SHIFT_ROWS = 3  # the value, and its derivatives by a shift of the disc
@@ -102,7 +102,7 @@ class DiscPixels:
             self._add_kurtosis(views, blur, on_disc)
         members = self.members[: self.starts[1]]  # the same for all circles
         _add_fourth_cumulants(views, inverse, blur.total_covariance, self.circles, members, on_disc)
-        slopes = np.empty((SLOPE_ROWS, views.shape[1]))
+        slopes = np.empty((JACOBIAN_ROWS, views.shape[1]))
         _carry_slopes(inverse, blur.vector, views, on_disc, slopes)
         return WhiteShare(views[:2], on_disc[0], slopes)
 
@@ -113,12 +113,12 @@ class DiscPixels:
         blur.
         """
         changed = np.zeros_like(on_disc)
-        for factor in (1.0 + KURTOSIS_SPREAD, 1.0 - KURTOSIS_SPREAD):
+        for factor in (1.0 + KURTOSIS_STEP, 1.0 - KURTOSIS_STEP):
             vector = blur.vector * np.array((factor, factor, factor, 1.0, 1.0))
             render(views, vector, self.circles, self.starts, self.members, changed)
         changed[0] += 2.0 * self.background
         changed[:_SHIFT_ROWS] -= 2.0 * on_disc[:_SHIFT_ROWS]
-        on_disc[:_SHIFT_ROWS] += self.kurtosis / (6.0 * KURTOSIS_SPREAD**2) * changed[:_SHIFT_ROWS]
+        on_disc[:_SHIFT_ROWS] += self.kurtosis / (6.0 * KURTOSIS_STEP**2) * changed[:_SHIFT_ROWS]
 
     def shares_within(self, geometry: Geometry, blur: Blur) -> FloatArray:
         """Return the share (k + 1, n) of every pixel that each blurred circle of a ring covers."""
@@ -188,7 +188,7 @@ def _distances(places_px: FloatArray, geometry: FloatArray, off_px: FloatArray) 
 def _meet_disc(
     geometry: FloatArray, places_px: FloatArray, inverse: FloatArray, views: FloatArray
 ) -> None:
-    """Fill in the inverse stretch (3,) xx, xy, yy and the first rows of views, as `meet_plate`."""
+    """Fill in the inverse stretch (3,) xx, xy, yy and the first rows of the plate views."""
     determinant = geometry[2] * geometry[4] - geometry[3] * geometry[3]
     inverse[0], inverse[1] = geometry[4] / determinant, -geometry[3] / determinant
     inverse[2] = geometry[2] / determinant

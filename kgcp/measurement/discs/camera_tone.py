@@ -52,7 +52,7 @@ _LARGEST_BLUR = 0.3  # of the radius, to start from
 # is at least the first and at least so many standard deviations.
 _MASK_STEP, _MOST_STEPS = 1.25, 2
 _LEAST_SHARPENING, _SIGNIFICANT = 0.05, 4.0
-_BENT = {Tone.SRGB: Tone.UNKNOWN, Tone.LINEAR: Tone.UNKNOWN_FROM_LINE}
+_BENT = {Tone.SRGB: Tone.UNKNOWN, Tone.LINEAR: Tone.UNKNOWN_OVER_LINE}
 # A curve is bent if that gains more than this in twice the log-likelihood. Bends are three
 # parameters; noise alone exceeds it once in a thousand times. A straight line that is bent by
 # chance makes discs larger or smaller by 1 %.
@@ -304,7 +304,7 @@ def _worth_comparing(plain: Sequence[JointFit], bent: Sequence[JointFit]) -> lis
     gain = unbent.loss - best.loss
     if 2.0 * gain <= _SIGNIFICANT_BENDS * _excess(best) ** _EXCESS_POWER:
         return [unbent]
-    line = next((joint for joint in bent if joint.tone is Tone.UNKNOWN_FROM_LINE), None)
+    line = next((joint for joint in bent if joint.tone is Tone.UNKNOWN_OVER_LINE), None)
     if unbent.tone is Tone.LINEAR and line is not None:
         farther = max(joint.loss for joint in plain) - unbent.loss
         if line.loss - best.loss <= _LINE_PREFERENCE * farther:

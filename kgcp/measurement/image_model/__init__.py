@@ -1,1 +1,1 @@
-"""Image of a plate: blur, exposure, tone curve, sharpening, noise."""
+"""Model of the image of a plate: blur, exposure, tone curve, sharpening, noise."""

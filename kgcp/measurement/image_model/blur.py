@@ -1,4 +1,4 @@
-"""Blur, and which pixels it lets feel which circle's edge."""
+"""The blur, and which pixels it brings within reach of which circle's edge."""
 
 from __future__ import annotations
 
@@ -12,33 +12,35 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.image_model.plate import Circles
 from kgcp.measurement.image_model.quadrature import quadrature_for
 
-REACH_SIGMAS = 3.7  # beyond, a blurred edge is flat to 1e-4 of the contrast
-_LEAST_SPREAD = 1e-4  # of the largest variance: of a plate that is all but edge-on
-_SLACK_PX = 0.6  # what a circle may move before the pairs are made anew
+REACH_SIGMAS = 3.7  # farther away, a blurred edge is flat to 1e-4 of the contrast
+# Least variance of the blur on the plate, relative to the largest. It matters if a plate is seen
+# almost edge-on.
+_MIN_SPREAD = 1e-4
+_SLACK_PX = 0.6  # by how much a circle may move before the incidence is computed again
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Blur:
-    """Spread of an image point."""
+    """The point spread of the image."""
 
-    # covariance of the Gaussian part, pixel integration included [px²]
+    # covariance of the Gaussian part, including the integration over a pixel [px²]
     xx: float
     yy: float
     xy: float
-    # motion during exposure [px]
+    # motion during the exposure [px]
     streak_x: float = 0.0
     streak_y: float = 0.0
     # (4,): third cumulants xxx, xxy, xyy, yyy [px³]
     skew: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    kurtosis: float = 0.0  # excess of the Gaussian part's, in all directions
+    kurtosis: float = 0.0  # excess kurtosis of the Gaussian part, the same in all directions
 
     @property
     def has_streak(self) -> bool:
-        """Whether there is motion."""
+        """Whether there is motion during the exposure."""
         return bool(self.streak_x or self.streak_y)
 
     def scaled(self, factor: float) -> Blur:
-        """Return the blur with all lengths times a factor."""
+        """Return the blur with all lengths multiplied by a factor."""
         square = factor * factor
         streak = (factor * self.streak_x, factor * self.streak_y)
         cube = square * factor
@@ -50,12 +52,12 @@ class Blur:
 
     @property
     def vector(self) -> FloatArray:
-        """All but skew and kurtosis, in the order of the attributes."""
+        """All values but skew and kurtosis (5,), in the order of the attributes."""
         return np.array([self.xx, self.yy, self.xy, self.streak_x, self.streak_y])
 
     @property
     def total_covariance(self) -> tuple[float, float, float]:
-        """Covariance of Gaussian and streak together: xx, yy, xy [px²]."""
+        """Covariance of the Gaussian part and the streak together: xx, yy, xy [px²]."""
         return (
             self.xx + self.streak_x**2 / 12.0,
             self.yy + self.streak_y**2 / 12.0,
@@ -64,7 +66,7 @@ class Blur:
 
     @property
     def largest_sd_px(self) -> float:
-        """Standard deviation along the direction of the strongest blur [px]."""
+        """Standard deviation in the direction of the strongest blur [px]."""
         xx, yy, xy = self.total_covariance
         return math.sqrt(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy))
 
@@ -76,24 +78,30 @@ class Blur:
 
 
 def variance_in_bins(variance_px2: float, count: int) -> float:
-    """Return a blur's variance in bins of `count` by `count` pixels, their integration included."""
+    """Return a variance [px²] in units of bins of `count` × `count` pixels, squared.
+
+    Both variances include the integration over a pixel or a bin.
+    """
     return (variance_px2 + (count * count - 1) / 12.0) / (count * count)
 
 
 def variance_in_pixels(variance: float, count: int) -> float:
-    """Return what `variance_in_bins` took [px²]; that of a pixel at least."""
+    """Return the variance [px²] from one in bins: the inverse of `variance_in_bins`.
+
+    It is at least that of the integration over a pixel.
+    """
     return max(1.0 / 12.0, count * count * variance - (count * count - 1) / 12.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeIncidence:
-    """Pairs of n pixels and c circles whose edges are within reach of the blur."""
+    """Which of n pixels are within reach of the blurred edges of which of c circles."""
 
-    circles: FloatArray  # (c, 5): centre x, y, radius [m], sign and rule of integration
-    # (c + 1,): the pixels that feel circle i are members[starts[i]:starts[i + 1]]
+    circles: FloatArray  # (c, 5): centre x, y and radius [m], sign, `Quadrature`
+    # (c + 1,): the pixels in reach of circle i are members[starts[i]:starts[i + 1]]
     starts: IndexArray
     members: IndexArray
-    # (n,): white share of every pixel from the circles whose edge it does not feel
+    # (n,): white share of every pixel due to the circles whose edges are out of reach
     background: FloatArray
 
 
@@ -104,7 +112,7 @@ def find_edge_incidence(
     blur: Blur,
     spread: FloatArray,
 ) -> EdgeIncidence:
-    """Find the pairs of pixels and circles whose edges are within reach of the blur.
+    """Find which pixels are within reach of which circles' blurred edges.
 
     Parameters
     ----------
@@ -113,36 +121,40 @@ def find_edge_incidence(
     metres_per_px : float
         Largest length on the plate that a pixel spans.
     spread : (3,) array
-        By `blur_on_plate`.
+        Result of `blur_on_plate`.
     """
     sd_m = blur.largest_sd_px * metres_per_px
     half_range = math.hypot(0.5 * (spread[0] - spread[2]), spread[1])
-    least = max(0.5 * (spread[0] + spread[2]) - half_range, _LEAST_SPREAD)
+    least = max(0.5 * (spread[0] + spread[2]) - half_range, _MIN_SPREAD)
     sharpest_m = sd_m * math.sqrt(least)
     table = np.empty((len(circles.radii_m), 5))
     table[:, 0], table[:, 1] = circles.centres_m
     table[:, 2], table[:, 3] = circles.radii_m, circles.signs
     table[:, 4] = quadrature_for(circles.radii_m / sd_m, circles.radii_m / sharpest_m)
     slack_m = _SLACK_PX * metres_per_px
-    return EdgeIncidence(table, *_pair(points_m, table, REACH_SIGMAS * sd_m, slack_m, spread))
+    return EdgeIncidence(table, *_pair_up(points_m, table, REACH_SIGMAS * sd_m, slack_m, spread))
 
 
 def reach_px(blur: Blur) -> float:
-    """Return how far from an edge pixels feel it, wherever a circle may move [px]."""
+    """Return the distance from an edge within which pixels may see it [px].
+
+    It includes the slack for moves of a circle.
+    """
     return REACH_SIGMAS * blur.largest_sd_px + _SLACK_PX
 
 
 @compiled
-def _pair(
+def _pair_up(
     points_m: FloatArray,
     circles: FloatArray,
     reach_m: float,
     slack_m: float,
     spread: FloatArray,
 ) -> tuple[IndexArray, IndexArray, FloatArray]:
-    """Return starts, members and background.
+    """Return starts, members and background of `EdgeIncidence`.
 
-    What is beyond the reach in its own direction from the circle's centre is so in all others.
+    A pixel outside a circle is out of reach if it is so along the direction from the circle's
+    centre, given the blur in that direction.
     """
     count, found, most_m = points_m.shape[1], 0, reach_m + slack_m
     starts, background = np.zeros(len(circles) + 1, np.intp), np.ones(count)
@@ -157,10 +169,10 @@ def _pair(
             if square < within_m * within_m:
                 background[i] += circles[c, 3]
             elif square <= beyond_m * beyond_m:
-                out_m = math.sqrt(square)
-                felt = spread[0] * dx * dx + 2.0 * spread[1] * dx * dy + spread[2] * dy * dy
-                beyond = out_m - circles[c, 2] - slack_m
-                if beyond > 0.0 and beyond * out_m > reach_m * math.sqrt(felt):
+                distance_m = math.sqrt(square)
+                spread_m2 = spread[0] * dx * dx + 2.0 * spread[1] * dx * dy + spread[2] * dy * dy
+                outside_m = distance_m - circles[c, 2] - slack_m
+                if outside_m > 0.0 and outside_m * distance_m > reach_m * math.sqrt(spread_m2):
                     continue
                 members[found] = i
                 found += 1

@@ -1,17 +1,16 @@
-"""The inner loop of the measurement, compiled: what blurred discs add to the pixels in reach.
+"""Blurred discs: their share in each pixel, with derivatives (compiled; the inner loop).
 
-A pixel sees the share of a disc that its blur covers: the integral of an anisotropic Gaussian, and
-of a motion, over the disc. It has no closed form. Along one direction the integral is closed, and
-two rules take care of the other one (docs/method.md, "Blurred discs", derives both):
+A pixel sees the integral over a disc of the point spread, which is an anisotropic Gaussian
+convolved with a motion. Over two dimensions it has no closed form. Along one direction it has;
+along the other there are two rules (docs/method.md, "Blurred discs", derives both):
 
-- discs that are large against the blur: their edge is a parabola there, and the mean over it is a
-  straight edge that is displaced, widened and skewed (`_add_straight`);
-- small ones: chords, at equal steps of the angle (`_add_chords`).
+- If a disc is large compared with the blur, its edge is a parabola within the blur. The mean over
+  that is a straight edge that is displaced, widened and skewed (`_add_straight`).
+- If it is small, the integral is a sum over chords at equal steps of an angle (`_add_chords`).
 
-Most time of the measurement is spent here, so that speed decides the form. Pixels are worked
-on in batches, step by step, in loops without a branch: several at once in the vector units of the
-processor. A batch is one flat array, row after row. Derivatives are worked out with the values,
-from the same intermediate results.
+Most of the measurement's time is spent here, so the code is written for speed. Pixels are processed
+in batches, in loops without branches, so that they are vectorised. A batch is one flat array, row
+after row. Derivatives are computed with the values, from the same intermediate results.
 """
 
 from __future__ import annotations
@@ -34,19 +33,20 @@ from kgcp.measurement.image_model.quadrature import (
 )
 
 _EDGE = float(Quadrature.EDGE)
-# Limits of the series; tests/measurement/image_model/test_blurred_discs.py holds the results to
-# those of plain integration on either side of each.
-_SHORT_SMEAR = 0.2  # of the blur: below, differences of the profile lose their digits
-_SHORTEST_SMEAR = 0.01  # of the blur: chords cannot tell a shorter one from none
-_SHORTEST_STREAK = 0.1  # of the blur: below, it has no direction
-_LEAST_DISTANCE_M = 1e-12  # keeps directions finite in a circle's centre
+# Limits of the motion's length, relative to the blur's σ, at which formulas change. The first two
+# are limits of half the length. tests/measurement/image_model/test_blurred_discs.py compares the
+# results on both sides of each with plain integration.
+_SHORT_SMEAR = 0.2  # below, a series replaces differences, which would lose their digits
+_MIN_SMEAR = 0.01  # chords take shorter motions as so long: the results are the same
+_MIN_STREAK = 0.1  # below, the direction of the motion has no effect
+_MIN_DISTANCE_M = 1e-12  # keeps directions finite at a circle's centre
 _PER_ROOT_2PI = 1.0 / math.sqrt(2.0 * math.pi)
-_BATCH = 16  # pixels: two to four full vectors, and all rows stay in the first-level cache
-# rows of a batch: where on the plate from the circle's centre, and how the blur lies there …
+_BATCH = 16  # pixels: two to four full vectors, and all rows fit into the first-level cache
+# Rows of a batch. Input: position on the plate from the circle's centre, blur and streak there.
 _X, _Y, _XX, _XY, _YY, _STREAK_X, _STREAK_Y, *_RESULTS = range(0, 32 * _BATCH, _BATCH)
-# … what comes of it: the white share, and its derivatives in the order of `render` …
+# Results: the white share, and its derivatives in the order of `render`.
 _VALUE, _BY_X, _BY_Y, _BY_DEPTH, _BY_XX, _BY_XY, _BY_YY, _BY_STREAK_X, _BY_STREAK_Y = _RESULTS[:9]
-# … and on the way there, for chords: directions, the blur along and across them, and sums
+# Intermediate values of `_add_chords`: directions of the chords, blur along and across them, sums.
 _U, _V, _ALONG, _ACROSS, _MIXED, _SMEAR, _PER_SD, _PER_SD_ACROSS = _RESULTS[9:17]
 _FIRST, _SIDEWAYS, _SECOND, _BY_SLOPE, _BY_WIDTH, _BY_HALF = _RESULTS[17:23]
 
@@ -58,14 +58,14 @@ _R0, _R1, _R2, _R3, _R4, _R5, _R6, _R7 = TAIL_RATIO
 def _normal(z: float) -> tuple[float, float]:
     """Return the standard normal distribution function, to 3e-8, and its density.
 
-    `math.erf` has branches and cannot be vectorised. Here the density is a polynomial for
-    exp(−z²/64), squared five times; the tail is the density times Mills' ratio, a polynomial in
-    1 / (1 + 0.3 z). `quadrature` fits both.
+    `math.erf` has branches and is not vectorised. Here the density is a polynomial for exp(−z²/64),
+    squared five times. The tail is the density times Mills' ratio, a polynomial in 1 / (1 + 0.3 z).
+    The polynomials are fitted in `quadrature`.
     """
     far = min(abs(z), FAR)
     q = far * far * (0.5 / 2**SQUARINGS)
     q2 = q * q
-    # by pairs of terms, which do not wait for each other (Estrin's scheme)
+    # Estrin's scheme: pairs of terms are independent of each other
     root = _E0 + _E1 * q + (_E2 + _E3 * q) * q2 + (_E4 + _E5 * q + _E6 * q2) * (q2 * q2)
     square = root * root
     square *= square
@@ -80,10 +80,11 @@ def _normal(z: float) -> tuple[float, float]:
 
 @fused
 def _long_smear(z: float, half: float) -> tuple[float, float, float, float, float]:
-    """Return the mean of the normal distribution function from z − half to z + half.
+    """Return the mean of the normal distribution function over z − half … z + half.
 
-    Also its derivatives by z and by `half`, and the densities at both ends. As z Φ(z) + φ(z) is an
-    integral of Φ, the mean is the difference of its values at the ends, over the length.
+    Returned are the mean, its derivatives by z and by `half`, and the densities at both ends. z
+    Φ(z) + φ(z) is an antiderivative of Φ, so the mean is the difference of its values at the ends,
+    divided by the length.
     """
     below_high, density_high = _normal(z + half)
     below_low, density_low = _normal(z - half)
@@ -97,13 +98,15 @@ def _long_smear(z: float, half: float) -> tuple[float, float, float, float, floa
 def _smeared_normal(
     z: float, half: float, slant: float, motion_t: float, smears: bool
 ) -> tuple[float, float, float, float]:
-    """Extend `_long_smear` to any length, 0 unless it `smears`; with what a unit of bend adds.
+    """Return the mean of `_long_smear` for any length, its derivatives, and the skew of the edge.
 
-    That is the mean over s, the place on the streak, −½ … ½, of φ(y) times
-    (slant · y + motion_t · s)² − slant² − motion_t²/12, where y = z − 2 · half · s is the blur
-    along the radius. It is closed, too: moments of φ between the ends of the streak. Their
-    differences lose their digits on short streaks; there the first terms of a series in `half`
-    replace them.
+    Without a streak (not `smears`) the length is 0.
+
+    The skew is what a unit of the edge's curvature adds. It is the mean over the streak of φ(y)
+    times (slant · y + motion_t · s)² − slant² − motion_t²/12. Here s is the position on the streak,
+    −½ … ½, and y = z − 2 · half · s the blur along the radius. It has a closed form, too, from
+    moments of φ between the ends of the streak. For short streaks, their differences would lose
+    digits, and the first terms of a series in `half` are used.
     """
     (below, density), slanted, moved = _normal(z), slant * slant, motion_t * motion_t
     curving = (z * z - 1.0) * density
@@ -124,28 +127,28 @@ def _smeared_normal(
 
 @fused
 def _turned(x: float, y: float, xx: float, xy: float, yy: float) -> tuple[float, float, float]:
-    """Return the blur's covariance along a direction, across it and mixed, by a rotation."""
+    """Return the blur's variances along and across a direction (x, y), and their covariance."""
     along = (xx * x + 2.0 * xy * y) * x + yy * y * y
     return along, xx + yy - along, (yy - xx) * x * y + xy * (x * x - y * y)
 
 
 @fused
 def _add_straight(w: FloatArray, radius: float, smears: bool, only_level: bool) -> None:
-    """Work out a batch of a circle that is large against the blur, in closed form.
+    """Compute a batch for a circle that is large compared with the blur, in closed form.
 
-    The arc that tangential blur ε reaches is a parabola: the edge is met at r − ε²/2r − ε⁴/8r³.
-    The mean of that shifts the edge inwards by v/2r + 3v²/8r³, with the variance v of ε; its
-    variance v²/2r² widens it. Motion along the radius averages the profile over its length. Motion
-    across bends the edge as blur does, but widens it less, because a uniform distribution has
+    Within the tangential blur ε, the circle is a parabola: the edge is at r − ε²/2r − ε⁴/8r³. Let v
+    be the variance of ε. The mean shifts the edge inwards by v/2r + 3v²/8r³, and the variance
+    v²/2r² widens it. Motion along the radius averages the profile over its length. Tangential
+    motion shifts the edge like tangential blur, but widens it less: a uniform distribution has
     shorter tails than a Gaussian of the same variance.
 
-    If blur or streak is oblique to the radius, its radial and tangential parts are correlated,
+    If blur or streak is oblique to the radius, its radial and tangential components are correlated,
     which changes the curvature term. The derivatives of this correction (a few per cent) are
     neglected.
     """
     bend = 0.5 / radius
     for j in range(_BATCH):
-        rho = math.sqrt(w[_X + j] * w[_X + j] + w[_Y + j] * w[_Y + j]) + _LEAST_DISTANCE_M
+        rho = math.sqrt(w[_X + j] * w[_X + j] + w[_Y + j] * w[_Y + j]) + _MIN_DISTANCE_M
         per_rho = 1.0 / rho
         x, y = w[_X + j] * per_rho, w[_Y + j] * per_rho
         radial, across, mixed = _turned(x, y, w[_XX + j], w[_XY + j], w[_YY + j])
@@ -178,24 +181,24 @@ def _add_straight(w: FloatArray, radius: float, smears: bool, only_level: bool) 
 
 @fused
 def _add_chords(w: FloatArray, radius: float, rule: int, smears: bool, only_level: bool) -> None:
-    """Work out a batch of a circle that is small against blur or streak, chord by chord.
+    """Compute a batch for a circle that is small compared with blur or streak, by chords.
 
-    Chords lie along the streak, or else along the radius. The density of the blur across them
-    weights each; the blur along them, given its part across, is Gaussian again and has closed
-    integrals. With the chord at r sin α, the step dα stands for a width of r cos α dα, which is
-    half the chord's length times dα.
+    Chords are parallel to the streak, or to the radius if there is none. Each is weighted by the
+    density of the blur across the chords. Along a chord, the blur conditional on the component
+    across is Gaussian, too, and its integral has a closed form. The chord at r sin α represents a
+    width of r cos α dα, which is half its length times dα.
     """
     for j in range(_BATCH):
         dx, dy = w[_X + j], w[_Y + j]
         u, v = (w[_STREAK_X + j], w[_STREAK_Y + j]) if smears else (dx, dy)
         length = math.sqrt(u * u + v * v)
-        u, v = u / (length + _LEAST_DISTANCE_M), v / (length + _LEAST_DISTANCE_M)
+        u, v = u / (length + _MIN_DISTANCE_M), v / (length + _MIN_DISTANCE_M)
         along, across, mixed = _turned(u, v, w[_XX + j], w[_XY + j], w[_YY + j])
         sd = math.sqrt(max(along - mixed * mixed / across, 1e-6 * along))
         w[_U + j], w[_V + j] = u, v
         w[_X + j], w[_Y + j] = dx * u + dy * v, dy * u - dx * v
         w[_ALONG + j], w[_ACROSS + j], w[_MIXED + j] = along, across, mixed
-        w[_SMEAR + j] = max(length, 2.0 * _SHORTEST_SMEAR * sd) if smears else 0.0
+        w[_SMEAR + j] = max(length, 2.0 * _MIN_SMEAR * sd) if smears else 0.0
         w[_PER_SD + j], w[_PER_SD_ACROSS + j] = 1.0 / sd, 1.0 / math.sqrt(across)
         w[_VALUE + j] = w[_FIRST + j] = w[_SIDEWAYS + j] = w[_SECOND + j] = 0.0
         w[_BY_SLOPE + j] = w[_BY_WIDTH + j] = w[_BY_HALF + j] = 0.0
@@ -204,7 +207,7 @@ def _add_chords(w: FloatArray, radius: float, rule: int, smears: bool, only_leve
         nearest = np.inf
         for j in range(_BATCH):
             nearest = min(nearest, abs(at - w[_Y + j]) * w[_PER_SD_ACROSS + j])
-        if nearest < FAR:  # else the chord weighs nothing for all pixels of the batch
+        if nearest < FAR:  # otherwise the chord's weight is 0 for all pixels of the batch
             _add_chord(w, at, half_length, smears, only_level)
     for j in range(_BATCH):
         scale = math.pi / (CHORD_COUNTS[rule] + 1) * w[_PER_SD_ACROSS + j]
@@ -223,7 +226,7 @@ def _add_chords(w: FloatArray, radius: float, rule: int, smears: bool, only_leve
         by_x, by_smear = -first, 0.5 * scale * w[_BY_HALF + j] * per_sd
         by_y = scale * w[_SIDEWAYS + j] * per_across + first * ratio
         turn = by_x * y - by_y * x + 2.0 * mixed * (by_a - by_c) + by_m * (across - along)
-        sideways = turn / smear if smear * per_across > _SHORTEST_STREAK else 0.0
+        sideways = turn / smear if smear * per_across > _MIN_STREAK else 0.0
         w[_BY_X + j], w[_BY_Y + j] = by_y * v - by_x * u, -by_y * u - by_x * v
         w[_BY_DEPTH + j] = 2.0 * (by_a * along + by_c * across + by_m * mixed) + by_smear * smear
         w[_BY_XX + j] = by_a * u * u + by_c * v * v - by_m * u * v
@@ -282,23 +285,21 @@ def render(
     members: IndexArray,
     out: FloatArray,
 ) -> None:
-    """Add to every pixel what the circles in its reach contribute.
+    """Add to every pixel the contributions of the circles within reach.
 
     Parameters
     ----------
     views : (15, n) array
-        Points and scales of the pixels on the plate, by `meet_plate`.
+        Views of the pixels, by `intersect_plate`.
     blur : (5,) array
         xx, yy, xy [px²], streak x, y [px].
-    circles : (c, 5) array
-        Centre x, y, radius, sign and rule of every circle.
-    starts : (c + 1,) array, members : (m,) array
-        The pixels in reach of circle i are members[starts[i]:starts[i + 1]].
+    circles, starts, members
+        As in `EdgeIncidence`.
     out : (9, n) or (1, n) array
-        White share from circles out of reach; receives the share and, where there is room, its
-        derivatives by the plate's motion along its two axes, by the relative depth, by the blur on
-        the plate xx, xy, yy and by the streak there x, y. A turn of the plate also changes the
-        blur on it; that is of second order and left out.
+        Row 0: white share from the circles out of reach, to which that of the others is added. The
+        other rows receive the derivatives of the share: by the plate's motion along its two axes,
+        by the relative depth, by the blur on the plate xx, xy, yy and by the streak there x, y. (A
+        rotation of the plate also changes the blur on it; this second-order effect is neglected.)
     """
     w = np.zeros(32 * _BATCH)
     only_level, smears = out.shape[0] == 1, blur[3] != 0.0 or blur[4] != 0.0
@@ -307,7 +308,7 @@ def render(
         for first in range(starts[c], starts[c + 1], _BATCH):
             pixels = members[first : min(first + _BATCH, starts[c + 1])]
             _gather(views, blur, circles[c], pixels, w)
-            if only_level:  # constant arguments: four versions are compiled, without branches
+            if only_level:  # constant arguments: four versions without branches are compiled
                 _add(w, r, rule, True, True) if smears else _add(w, r, rule, False, True)
             else:
                 _add(w, r, rule, True, False) if smears else _add(w, r, rule, False, False)
@@ -320,10 +321,10 @@ def render(
 def _gather(
     views: FloatArray, blur: FloatArray, circle: FloatArray, pixels: IndexArray, w: FloatArray
 ) -> None:
-    """Fill a batch with where some pixels are, from the circle's centre, and their blur there.
+    """Fill a batch with positions of pixels from the circle's centre, and the blur on the plate.
 
-    The blur on the plate is A B Aᵀ, with the metres per pixel A and the blur B in the image. A
-    batch that is not full repeats its last pixel.
+    The blur on the plate is A B Aᵀ, with the blur B in the image and the metres per pixel A (2, 2).
+    If there are too few pixels for a batch, the last one is repeated.
     """
     for j in range(_BATCH):
         i = pixels[min(j, len(pixels) - 1)]

@@ -1,9 +1,10 @@
-"""The plate under blur: white share of every pixel, with derivatives for the adjustment.
+"""The blurred plate: white share of every pixel, with derivatives for the adjustment.
 
-The plate is a sum of discs, white minus black: blur is linear, so every circle is blurred on its
-own and the results are added. Blur lives in the image; within its reach the map from image to plate
-is taken as affine, pixel by pixel, so that a disc stays an exact circle on the plate and the blur
-becomes an anisotropic Gaussian there. `kgcp.measurement.image_model.blurred_discs` does it.
+The plate is a sum of white and black discs. Blur is linear, so each disc is blurred on its own and
+the results are added. The blur is given in the image. Within its reach, the map from image to plate
+is taken as affine, separately at each pixel. So a disc stays an exact circle on the plate, and the
+blur becomes an anisotropic Gaussian there. `kgcp.measurement.image_model.blurred_discs` computes
+the blurred discs.
 """
 
 from __future__ import annotations
@@ -16,30 +17,30 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.image_model.blur import EdgeIncidence
 from kgcp.measurement.image_model.blurred_discs import render
 from kgcp.measurement.image_model.ray_plate import (
+    JACOBIAN_ROWS,
     PLATE_ROWS,
-    SLOPE_ROWS,
-    carry_slopes,
-    views_of,
+    chain_to_parameters,
+    plate_views,
 )
 
-KURTOSIS_SPREAD = 0.3
-"""q of `kurtosis_row`; larger ones would reach beyond the pixels that feel an edge."""
+KURTOSIS_STEP = 0.3
+"""q of `kurtosis_row`; with a larger one, blur would reach beyond the incident pixels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WhiteShare:
     """White share of n pixels and its derivatives."""
 
-    views: FloatArray  # (15, n): of the pixels, by `meet_plate`
-    value: FloatArray  # (n,): 0: ink, 1: plate
-    # (11, n): with respect to translation [m], rotation vector [rad] (left perturbation in the
-    # camera frame), blur (xx + yy)/2, (xx − yy)/2, xy [px²] and streak x, y [px]; (0, n) by
-    # `white_share_only`
+    views: FloatArray  # (15, n): views of the pixels, by `intersect_plate`
+    value: FloatArray  # (n,): from ink, 0, to plate, 1
+    # (11, n): derivatives by translation [m], rotation vector [rad] (left perturbation in the
+    # camera frame), blur (xx + yy)/2, (xx − yy)/2, xy [px²] and streak x, y [px]. (0, n) from
+    # `white_share_without_derivatives`.
     jacobian: FloatArray
 
     @property
     def points_m(self) -> FloatArray:
-        """Where the pixels' rays meet the plate (2, n)."""
+        """Points (2, n) where the pixels' rays meet the plate."""
         return self.views[:2]
 
 
@@ -53,17 +54,17 @@ def white_share(
     pose : (3, 4) array
         `Pose.matrix`.
     rays : (6, n) array
-        As of a window.
+        As in `Window`.
     blur : (5,) array
         `Blur.vector`.
     """
     views, on_plate = _rendered(pose, rays, blur, incidence, PLATE_ROWS)
-    slopes = np.empty((SLOPE_ROWS, rays.shape[1]))
-    carry_slopes(pose, views, on_plate, slopes)
+    slopes = np.empty((JACOBIAN_ROWS, rays.shape[1]))
+    chain_to_parameters(pose, views, on_plate, slopes)
     return WhiteShare(views, on_plate[0], slopes)
 
 
-def white_share_only(
+def white_share_without_derivatives(
     pose: FloatArray, rays: FloatArray, blur: FloatArray, incidence: EdgeIncidence
 ) -> WhiteShare:
     """Return the white share of every pixel without derivatives, at less than half the cost."""
@@ -78,30 +79,31 @@ def kurtosis_row(
     blur: FloatArray,
     incidence: EdgeIncidence,
 ) -> FloatArray:
-    """Return the derivative (n,) of a white share by the excess kurtosis of the Gaussian spread.
+    """Return the derivative (n,) of a white share by the excess kurtosis of the Gaussian part.
 
-    A spread that is half the Gaussian of covariance (1 + q) Σ and half that of (1 − q) Σ has the
-    excess kurtosis 3 q² in all directions, and moments up to the third as if both were Σ. So the
-    second difference of the share by q is what kurtosis does to it, whatever the sign.
+    The mean of two Gaussians with the covariances (1 + q) Σ and (1 − q) Σ has the excess kurtosis 3
+    q² in all directions. Its moments up to the third are those of a Gaussian with covariance Σ. So
+    the second difference of the share by q is the effect of kurtosis, which is linear and holds for
+    either sign.
 
     Parameters
     ----------
     share : (n,) array
-        By `white_share`; the other parameters are those it is made with.
+        Result of `white_share` with the other parameters.
     """
     changed = np.zeros(len(share))
-    for factor in (1.0 + KURTOSIS_SPREAD, 1.0 - KURTOSIS_SPREAD):
-        of_factor = blur.copy()
-        of_factor[:3] *= factor
-        changed += white_share_only(pose, rays, of_factor, incidence).value
-    return np.asarray((changed - 2.0 * share) / (6.0 * KURTOSIS_SPREAD**2))
+    for factor in (1.0 + KURTOSIS_STEP, 1.0 - KURTOSIS_STEP):
+        scaled = blur.copy()
+        scaled[:3] *= factor
+        changed += white_share_without_derivatives(pose, rays, scaled, incidence).value
+    return np.asarray((changed - 2.0 * share) / (6.0 * KURTOSIS_STEP**2))
 
 
 def _rendered(
     pose: FloatArray, rays: FloatArray, blur: FloatArray, incidence: EdgeIncidence, rows: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return views (15, n) and what is seen (rows, n)."""
-    views, on_plate = views_of(pose, rays), np.zeros((rows, rays.shape[1]))
+    """Return views (15, n), and the white share with derivatives on the plate (rows, n)."""
+    views, on_plate = plate_views(pose, rays), np.zeros((rows, rays.shape[1]))
     on_plate[0] = incidence.background
     render(views, blur, incidence.circles, incidence.starts, incidence.members, on_plate)
     return views, on_plate

@@ -1,28 +1,26 @@
-"""What edges show beyond the Gaussian blur of an evenly lit plate, to first order.
+"""First-order corrections at edges: skew, smoothing along contours, light that varies.
 
-**Skew.** A point spread with the third cumulants κ adds −1/6 Σ κ_ijk ∂_ijk C to the blurred disc C
-(the next term of its expansion after the Gaussian). C is taken as that of an edge with the disc's
-curvature.
+**Skew.** A point spread with third cumulants κ adds −1/6 Σ κ_ijk ∂_ijk C to the blurred disc C;
+this is the next term of its expansion after the Gaussian. C is approximated by an edge with the
+disc's curvature.
 
-**Smoothing along contours.** Noise reduction in cameras smooths along edges more than across them,
-and a lens's tails and sharpening change the second moment of the point spread without changing how
-steep edges are. A smoothing of variance β along a contour of curvature k displaces it by ½ β k
-towards its centre of curvature: dots, inner and outer circle shrink, each by another length. The
-blur's own share of that is in the blurred discs already; β is what there is beyond it, of either
-sign.
+**Smoothing along contours.** Noise reduction in cameras smooths along edges more than across them.
+A lens's tails and sharpening change the second moment of the point spread without changing the
+slope of edges. A smoothing of variance β along a contour of curvature k displaces it by ½ β k
+towards its centre of curvature. So dots, inner circle and outer circle shrink by different lengths.
+The blur's own effect of this kind is part of the blurred discs; β is the rest, of either sign.
 
-**Light across edges.** Blur spreads light times reflectance, and not each of them alone. With f the
-contrast that the light makes and S the white share, both blurred by a Gaussian of covariance Σ
-already,
+**Light across edges.** Blur acts on the product of light and reflectance, not on each of them. Let
+f be the contrast due to the light and S the white share, both blurred by a Gaussian of covariance
+Σ. Then
 
     blurred(light · reflectance) = f S + ∇fᵀ Σ ∇S + …
 
-(the terms go on with Σ² ∇∇f ∇∇S / 2, small while a penumbra is wider than the blur). In the
-penumbra of a shadow the second term displaces edges by up to 0.1 px, all edges along the shadow in
-one direction.
+The next term, Σ² ∇∇f ∇∇S / 2, is small if a penumbra is wider than the blur. In the penumbra of a
+shadow the second term displaces edges by up to 0.1 px: all edges along the shadow in one direction.
 
-Pixels are worked on in batches, as in `kgcp.measurement.image_model.blurred_discs`: in loops
-without a branch, the vector units of the processor take several at once.
+Pixels are processed in batches, as in `kgcp.measurement.image_model.blurred_discs`, in loops
+without branches that are vectorised.
 """
 
 from __future__ import annotations
@@ -36,16 +34,16 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.image_model.blur import EdgeIncidence
 
 _BATCH = 32  # pixels
-# Rows of a batch, one behind the other: where pixels are on the plate from a circle's centre; the
-# metres there, along x and then y, per raw pixel right and down; …
+# Rows of a batch. Position on the plate from the circle's centre [m]; metres on the plate along x
+# and along y per raw pixel to the right and down.
 _X, _Y, _X_RIGHT, _X_DOWN, _Y_RIGHT, _Y_DOWN, *_OTHERS = range(0, 14 * _BATCH, _BATCH)
-# … distance from the centre [m], metres on the plate per pixel square to the edge, and the unit
-# normal of the edge in the image, outwards; what comes of it
+# Distance from the centre [m]; metres on the plate per pixel perpendicular to the edge; the edge's
+# unit normal in the image, outwards; results.
 _OUT, _PER_PX, _NORMAL_X, _NORMAL_Y, _FIRST, _SECOND, _THIRD, _FOURTH = _OTHERS
-_LEAST_DISTANCE_M = 1e-9  # keeps directions finite in a circle's centre
+_MIN_DISTANCE_M = 1e-9  # keeps directions finite at a circle's centre
 _SQUARINGS = 10
 _PART = 0.5**_SQUARINGS
-_LEAST_EXPONENT = -200.0  # keeps what is endlessly far from an edge at zero
+_MIN_EXPONENT = -200.0  # keeps the polynomial finite; the density is 0 there
 
 
 def skew_rows(
@@ -58,9 +56,9 @@ def skew_rows(
     Parameters
     ----------
     views : (15, n) array
-        Of the pixels, by `kgcp.measurement.image_model.ray_plate.meet_plate`.
+        Views of the pixels, by `kgcp.measurement.image_model.ray_plate.intersect_plate`.
     covariance : (3,) tuple
-        Of the blur: xx, yy, xy [px²].
+        Covariance of the blur: xx, yy, xy [px²].
     """
     rows = np.zeros((4, views.shape[1]))
     _add_skew(views, *covariance, incidence.circles, incidence.starts, incidence.members, rows)
@@ -80,9 +78,9 @@ def _add_skew(
 ) -> None:
     """Add −⅙ of the third derivatives of the blurred discs.
 
-    Along normal n and tangent t of its edge, a disc that is blurred to C has
-    ∂ₙₙₙC = (1 − z²) φ(z) / σ³ and, since the edge is bent with the radius ρ in the image,
-    ∂ₙₜₜC = C″/ρ − C′/ρ².
+    Let n and t be the normal and the tangent of an edge, and ρ its radius of curvature in the
+    image. The derivatives of the blurred disc C are ∂ₙₙₙC = (1 − z²) φ(z) / σ³ and, because of the
+    curvature, ∂ₙₜₜC = C″/ρ − C′/ρ².
     """
     w = np.ones(14 * _BATCH)
     for c in range(len(circles)):
@@ -132,10 +130,10 @@ def _add_smoothing(
     members: IndexArray,
     rows: FloatArray,
 ) -> None:
-    """Add by how much the discs shrink where contours are smoothed.
+    """Add the effect of the shrinking of discs by smoothing along contours.
 
-    A pixel's step along the contour in the image is a step t on the plate along the circle, whose
-    edge is displaced by t² / 2r there.
+    A step of one pixel along the contour in the image is a step t along the circle on the plate.
+    For β = 1 px², the edge is displaced by t² / 2r on the plate.
     """
     w = np.ones(14 * _BATCH)
     for c in range(len(circles)):
@@ -155,9 +153,9 @@ def _add_smoothing(
 def spread_share_gradient(
     views: FloatArray, covariance: tuple[float, float, float], incidence: EdgeIncidence
 ) -> FloatArray:
-    """Return Σ ∇S (2, n) [px]: the white share's gradient in the image, times the blur.
+    """Return Σ ∇S (2, n) [px]: the blur's covariance times the white share's image gradient.
 
-    Parameters are those of `skew_rows`; Σ is the covariance.
+    Parameters are those of `skew_rows`.
     """
     rows = np.zeros((2, views.shape[1]))
     _add_gradient(views, *covariance, incidence.circles, incidence.starts, incidence.members, rows)
@@ -193,9 +191,9 @@ def _add_gradient(
 
 @inlined
 def _gather_edges(views: FloatArray, circle: FloatArray, pixels: IndexArray, w: FloatArray) -> None:
-    """Fill a batch with where some pixels are, and how a circle's edge lies in the image there.
+    """Fill a batch with positions of pixels, and with normal and scale of a circle's edge there.
 
-    What a batch that is not full has behind them is never used.
+    If there are too few pixels for a batch, the remaining entries are never used.
     """
     for j in range(len(pixels)):
         i = pixels[j]
@@ -204,7 +202,7 @@ def _gather_edges(views: FloatArray, circle: FloatArray, pixels: IndexArray, w: 
         w[_Y_RIGHT + j], w[_Y_DOWN + j] = views[4, i], views[5, i]
     for j in range(_BATCH):
         x, y = w[_X + j], w[_Y + j]
-        out_m = max(math.sqrt(x * x + y * y), _LEAST_DISTANCE_M)
+        out_m = max(math.sqrt(x * x + y * y), _MIN_DISTANCE_M)
         right = (x * w[_X_RIGHT + j] + y * w[_Y_RIGHT + j]) / out_m
         down = (x * w[_X_DOWN + j] + y * w[_Y_DOWN + j]) / out_m
         per_px = math.sqrt(right * right + down * down)
@@ -214,7 +212,7 @@ def _gather_edges(views: FloatArray, circle: FloatArray, pixels: IndexArray, w: 
 
 @inlined
 def _step_along(w: FloatArray, j: int) -> float:
-    """Return the step along the circle [m] that a pixel's step along the contour is."""
+    """Return the length along the circle on the plate [m] of one pixel along its contour."""
     nx, ny = w[_NORMAL_X + j], w[_NORMAL_Y + j]
     step_x = w[_X_DOWN + j] * nx - w[_X_RIGHT + j] * ny
     step_y = w[_Y_DOWN + j] * nx - w[_Y_RIGHT + j] * ny
@@ -226,10 +224,10 @@ def _step_along(w: FloatArray, j: int) -> float:
 def _density(z: float) -> float:
     """Return the standard normal density, with a relative error of 5e-11 at z = 6.
 
-    A library's exponential cannot be vectorised. Its argument is halved ten times, and the power of
-    it squared as often.
+    A library's exponential is not vectorised. Here it is a polynomial of the argument divided by
+    2¹⁰, squared ten times.
     """
-    x = max(-0.5 * z * z, _LEAST_EXPONENT) * _PART
+    x = max(-0.5 * z * z, _MIN_EXPONENT) * _PART
     power = 1.0 + x * (1.0 + x * (1 / 2 + x * (1 / 6 + x * (1 / 24 + x * (1 / 120)))))
     for _ in range(_SQUARINGS):
         power *= power
@@ -238,7 +236,7 @@ def _density(z: float) -> float:
 
 @inlined
 def _add_results(w: FloatArray, pixels: IndexArray, rows: FloatArray) -> None:
-    """Add what a batch has worked out to the pixels' rows (k, n)."""
+    """Add the results of a batch to the rows (k, n) of its pixels."""
     for k in range(rows.shape[0]):
         for j in range(len(pixels)):
             rows[k, pixels[j]] += w[_FIRST + k * _BATCH + j]

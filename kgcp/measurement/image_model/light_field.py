@@ -1,7 +1,8 @@
 """Uneven light: how the levels of ink and plate vary over a window.
 
-The levels have offsets, a smooth part, splines on two grids of knots, and may have straight edges
-of shadows. All add to the levels of ink and of plate, before tone curve and sharpening as those do.
+What is added to the levels of ink and of plate has three parts: an offset, a smooth part (splines
+on two grids of knots), and straight edges of shadows. All act before tone curve and sharpening, as
+the levels do.
 """
 
 from __future__ import annotations
@@ -18,19 +19,22 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.image_model.shadow_edges import INK, ShadowEdges
 
 LightAfterStep = Callable[[FloatArray, FloatArray], FloatArray]
-"""Where light (2, n), of ink 0 and of plate 1 where it is even, is after a step (2, n)."""
-SPAN = 3  # knots in reach of a point, along either axis: quadratic splines
-_EVEN = np.array(((0.0,), (1.0,)))  # light of ink and of plate where it is even
+"""A function that returns the light (2, n) on ink and on plate after a step (2, n).
+
+In even light, that on ink is 0 and that on plate 1.
+"""
+SPAN = 3  # knots along either axis on which a point depends: quadratic splines
+_EVEN = np.array(((0.0,), (1.0,)))  # light on ink and on plate in even light
 LEVEL_OFFSET_PRECISION = 4.0
-"""Of the offsets' prior: as weak as that of what edges of shadows add."""
+"""Precision of the offsets' prior: as weak as that of the steps at shadow edges."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Knots:
-    """Grids of knots over a window."""
+    """g grids of spline knots over a window."""
 
     spacings_px: tuple[float, ...]  # (g,)
-    # (g,): the corner of each grid's first cell [px], and how many knots it has
+    # (g,): corner of each grid's first cell [px], and numbers of knots
     x0_px: tuple[float, ...]
     y0_px: tuple[float, ...]
     columns: tuple[int, ...]
@@ -42,12 +46,12 @@ class Knots:
         return tuple(c * r for c, r in zip(self.columns, self.rows, strict=True))
 
     def of_grid(self, grid: int) -> slice:
-        """Return which of all knots are those of a grid."""
+        """Return the slice of all knots that belongs to a grid."""
         first = sum(self.counts[:grid])
         return slice(first, first + self.counts[grid])
 
     def weights(self, pixels: FloatArray) -> tuple[IndexArray, FloatArray]:
-        """Return the knots (n, 9 g) that points (2, n) depend on, and by how much each."""
+        """Return the knots (n, 9 g) on which points (2, n) depend, and their weights."""
         reach = SPAN * SPAN
         knots = np.empty((pixels.shape[1], reach * len(self.spacings_px)), np.intp)
         weights = np.empty(knots.shape)
@@ -63,20 +67,20 @@ class Knots:
         return knots, weights
 
     def places_px(self, grid: int) -> FloatArray:
-        """Return where the knots of a grid are (2, k)."""
+        """Return the positions of a grid's knots (2, k)."""
         return _places_px(self, grid)
 
 
-def knots_over(
+def lay_knots(
     x_px: tuple[float, float],
     y_px: tuple[float, float],
     centre_px: FloatArray,
     spacings_px: tuple[float, ...],
 ) -> Knots:
-    """Lay grids over the pixels between two columns and two rows, these included.
+    """Return grids over the pixels between two columns and two rows, inclusive.
 
-    A point (2,) is in the middle of a cell of every grid: what is about it is seen with the same
-    knots wherever the window ends, and whichever way up the frame is.
+    `centre_px` (2,) is in the middle of a cell of every grid. So the knots around it do not depend
+    on where the window ends, nor on the frame's orientation.
     """
     x0_px, columns = _cells_over(*x_px, float(centre_px[0]), spacings_px)
     y0_px, rows = _cells_over(*y_px, float(centre_px[1]), spacings_px)
@@ -86,7 +90,7 @@ def knots_over(
 def _cells_over(
     first_px: float, last_px: float, centre_px: float, spacings_px: tuple[float, ...]
 ) -> tuple[tuple[float, ...], tuple[int, ...]]:
-    """Return where the first cell of each grid begins along an axis, and how many knots it has."""
+    """Return the start of each grid's first cell along an axis [px], and the numbers of knots."""
     begins, counts = [], []
     for spacing in spacings_px:
         before = math.ceil((centre_px - (first_px - 0.5)) / spacing - 0.5)
@@ -128,9 +132,9 @@ def _add_grid(
     values: FloatArray,
     seen: FloatArray,
 ) -> None:
-    """Add what one grid adds to ink and plate, and the gradient of its contrast: seen (4, n).
+    """Add one grid's part to `seen` (4, n): ink, plate, and the gradient x, y of their contrast.
 
-    Sums down the columns of knots come first: pixels that follow each other in a row of one cell
+    Sums over the columns of knots are computed first, because consecutive pixels in a row of a cell
     share them.
     """
     (x0, y0), (columns, rows) = corner, counts
@@ -166,7 +170,7 @@ def _add_grid(
 
 @inlined
 def _cell(at_px: float, first_px: float, spacing: float, count: int) -> tuple[int, float]:
-    """Return the first of the three knots in reach along an axis, and where in its cell."""
+    """Return the first of the three knots along an axis, and the position in the cell, 0…1."""
     t = (at_px - first_px) / spacing
     knot = min(max(int(np.floor(t)), 0), count - 3)
     return knot, t - knot
@@ -174,7 +178,7 @@ def _cell(at_px: float, first_px: float, spacing: float, count: int) -> tuple[in
 
 @inlined
 def _fill_spline(t: float, weights: FloatArray) -> None:
-    """Fill in the weights (3,) of the knots in reach: a quadratic spline."""
+    """Fill in the weights (3,) of the three knots: a quadratic B-spline."""
     weights[0], weights[2] = 0.5 * (1.0 - t) * (1.0 - t), 0.5 * t * t
     weights[1] = 1.0 - weights[0] - weights[2]
 
@@ -187,18 +191,18 @@ def _fill_slopes(t: float, spacing: float, slopes: FloatArray) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightField:
-    """Deviations of the levels of ink and plate from their means over a window."""
+    """What uneven light adds to the levels of ink and plate over a window."""
 
     knots: Knots
-    values: FloatArray  # (2, k): of ink and plate at all knots
-    precision: FloatArray  # (2, k): of the values' prior, about 0
+    values: FloatArray  # (2, k): for ink and plate at all knots
+    precision: FloatArray  # (2, k): of the values' priors, whose means are 0
     offsets: FloatArray  # (2,): added to the levels of ink and plate everywhere
-    shadows: ShadowEdges  # about the centre
-    centre_px: FloatArray  # (2,)
+    shadows: ShadowEdges  # relative to the centre
+    centre_px: FloatArray  # (2,): the target's centre
 
     @property
     def penalty(self) -> float:
-        """The priors' part of the negative log-likelihood."""
+        """Contribution of the priors to the negative log-likelihood."""
         of_offsets = 0.5 * LEVEL_OFFSET_PRECISION * float(self.offsets @ self.offsets)
         of_values = 0.5 * float(np.sum(self.precision * self.values**2))
         return of_values + of_offsets + self.shadows.penalty
@@ -208,7 +212,7 @@ class LightField:
         return self.added_with_gradient(pixels)[0]
 
     def added_with_gradient(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return what `added` does, and the gradient (2, n) [1/px] of plate's contrast to ink."""
+        """Return the same as `added`, and the gradient (2, n) [1/px] of plate minus ink."""
         seen = np.zeros((4, pixels.shape[1]))
         for grid in range(len(self.knots.spacings_px)):
             _add_values(self.knots, grid, self.values[:, self.knots.of_grid(grid)], pixels, seen)
@@ -219,7 +223,7 @@ class LightField:
         return added + by_shadows, gradient + gradient_of_shadows
 
     def edge_rows(self, pixels: FloatArray, by_level: FloatArray) -> FloatArray:
-        """Return the derivatives (5 s, n) by the shadows' edges.
+        """Return the derivatives (5 s, n) of grey values by the parameters of s shadow edges.
 
         `by_level` (2, n) are those by the levels of ink and plate.
         """
@@ -235,10 +239,11 @@ class LightField:
         edges: FloatArray,
         light_after: LightAfterStep,
     ) -> LightField:
-        """Return the field after a step of values, offsets and shadows' edges.
+        """Return the field after a step of values, offsets and shadow edges.
 
-        Light moves on curves, as `light_after` says: to x + step + a correction, which is nearly
-        linear in x. So offsets, grids and edges share it as they share the light.
+        The light x is not simply moved by its step. `light_after` moves it to x + step + a
+        correction, which is nearly linear in x. Therefore the correction is distributed to offsets,
+        grids and edges in the same way as the light is.
         """
         base, step = _EVEN + self.offsets[:, None], offsets[:, None]
 
@@ -280,7 +285,7 @@ def _places_px(knots: Knots, grid: int) -> FloatArray:
 def _add_values(
     knots: Knots, grid: int, values: FloatArray, pixels: FloatArray, seen: FloatArray
 ) -> None:
-    """Add to `seen` what `_add_grid` does, for the values (2, k) of one grid."""
+    """Apply `_add_grid` to the values (2, k) of one grid."""
     counts = knots.columns[grid], knots.rows[grid]
     spacing = knots.spacings_px[grid]
     corner = knots.x0_px[grid], knots.y0_px[grid]
@@ -288,7 +293,7 @@ def _add_values(
 
 
 def _of_grid(knots: Knots, grid: int, values: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Return what the values (2, k) of one grid add at pixels (2, n)."""
+    """Return what one grid with values (2, k) adds to ink and plate at pixels (2, n)."""
     seen = np.zeros((4, pixels.shape[1]))
     _add_values(knots, grid, values, pixels, seen)
     return seen[:2]

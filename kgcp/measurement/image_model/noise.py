@@ -40,12 +40,12 @@ _PILED_UP, _JUST_BELOW = 0.05, 0.98
 # are looked for in the next six grey values, and their number there is compared with that in the
 # six below.
 _MAX_SMEAR_COUNTS = 6
-# Compression is detected if the six contain more pixels than the six below, by at least the first of
-# these shares of the latter. In 120 frames without compression the excess was at most 0.8, unless
-# the plate itself was at the limit. In 200 JPEGs it was nearly always 1 to 30. Before, the excess
-# was compared with 0.15 of the clipped pixels. Then the smeared pixels of large plates went
-# undetected and counted as exact: burnt rings of R > 26 px in JPEGs with a known response had
-# distances off by 0.12 % (RMS), now by 0.005 %. Pixels within so many standard deviations of the
+# Compression is detected if the six contain more pixels than the six below, by at least the first
+# number times the latter. In 120 frames without compression this excess was at most 0.8, unless the
+# plate itself was at the limit. In 200 JPEGs it was nearly always 1 to 30. Before, the excess was
+# compared with 0.15 of the clipped pixels. Then the smeared pixels of large plates went undetected
+# and counted as exact: burnt rings of R > 26 px in JPEGs with a known response had distances off by
+# 0.12 % (RMS), now by 0.005 %. Pixels within the second number of standard deviations of the
 # excess's distribution count as clipped, too.
 _MIN_SMEAR_EXCESS, _SMEAR_SIGMAS = 1.0, 2.5
 # Beside edges, grey values pile up just below the limit without compression, too: blur ends there,
@@ -125,13 +125,13 @@ def find_censoring(levels: FloatArray, levels_per_count: float, width: int) -> C
         at_top = float(np.mean(levels == top))
         if at_top > _PILED_UP > float(np.mean(levels > _JUST_BELOW * top)) - at_top:
             high, brightest = top - 0.5 * levels_per_count, top
-    of_top, of_bottom = (_smear_counts(number) for number in (near_top, near_bottom))
-    if of_top and not _is_smeared_away(1.0 - levels, levels_per_count, width):
-        of_top = 0
-    if of_bottom and not _is_smeared_away(levels, levels_per_count, width):
-        of_bottom = 0
-    high, low = high - of_top * levels_per_count, low + of_bottom * levels_per_count
-    ceiling, floor = 1.0 if of_top else math.inf, 0.0 if of_bottom else -math.inf
+    top_smear, bottom_smear = (_smear_counts(number) for number in (near_top, near_bottom))
+    if top_smear and not _is_smeared_away(1.0 - levels, levels_per_count, width):
+        top_smear = 0
+    if bottom_smear and not _is_smeared_away(levels, levels_per_count, width):
+        bottom_smear = 0
+    high, low = high - top_smear * levels_per_count, low + bottom_smear * levels_per_count
+    ceiling, floor = 1.0 if top_smear else math.inf, 0.0 if bottom_smear else -math.inf
     return Censoring(high, low, levels >= high, levels <= low, ceiling, floor, brightest)
 
 
@@ -254,19 +254,19 @@ def _estimate(
 ) -> None:
     in_bands, from_edges, is_linear_in_share = choices
     ink, white = _plateau_variances(residuals, share, usable, floor, from_edges, is_linear_in_share)
-    edge, of_edge = np.empty(len(share)), 0
+    edge, edge_count = np.empty(len(share)), 0
     for i in range(len(share)):
         within = min(max(share[i], 0.0), 1.0)
         variance = max(ink + (white - ink) * within, floor)
         plateau_sd[i] = math.sqrt(variance)
         if usable[i] and 0.2 < within < 0.8:
-            edge[of_edge] = residuals[i] * residuals[i] / variance
-            of_edge += 1
-    standardised = _trimmed_variance(edge[:of_edge])
+            edge[edge_count] = residuals[i] * residuals[i] / variance
+            edge_count += 1
+    standardised = _trimmed_variance(edge[:edge_count])
     excess = 0.0 if math.isnan(standardised) else max(0.0, standardised - 1.0)
     if in_bands:
-        of_band = _band_variances(residuals, share, usable, (ink, white, excess, floor))
-        _interpolate(share, 0.5 * np.log(of_band), sd)
+        band_variances = _band_variances(residuals, share, usable, (ink, white, excess, floor))
+        _interpolate(share, 0.5 * np.log(band_variances), sd)
         return
     for i in range(len(share)):
         sd[i] = math.sqrt(_variance_at(share[i], ink, white, excess, floor))
@@ -306,10 +306,10 @@ def _band_variances(
     residuals: FloatArray,
     share: FloatArray,
     usable: BoolArray,
-    of_line: tuple[float, float, float, float],
+    line: tuple[float, float, float, float],
 ) -> FloatArray:
     """Return the variances of the bands, drawn towards `_variance_at` if there are few pixels."""
-    ink, white, excess, floor = of_line
+    ink, white, excess, floor = line
     squares, starts = _by_band(residuals, share, usable)
     variances = np.empty(len(_BAND_MIDDLES))
     for band in range(len(_BAND_MIDDLES)):
@@ -363,8 +363,8 @@ def _plateau_variances(
     If there are too few pixels of ink or of plate, its variance is that of the other one, or
     (`from_edges`) that at edges. If there are too few of both, the variance of all pixels is used.
     """
-    ink, of_ink = _mean_variance(residuals, share, usable, -math.inf, 0.15)
-    white, of_white = _mean_variance(residuals, share, usable, 0.85, math.inf)
+    ink, ink_share = _mean_variance(residuals, share, usable, -math.inf, 0.15)
+    white, white_share = _mean_variance(residuals, share, usable, 0.85, math.inf)
     is_ink_seen, is_white_seen = not math.isnan(ink), not math.isnan(white)
     if not (is_ink_seen or is_white_seen):
         variance, _ = _mean_variance(residuals, share, usable, -math.inf, math.inf)
@@ -372,19 +372,21 @@ def _plateau_variances(
         return variance, variance
     if not (is_ink_seen and is_white_seen):
         seen = ink if is_ink_seen else white
-        at_edges, of_edges = _mean_variance(residuals, share, usable, 0.2, 0.8)
+        at_edges, edge_share = _mean_variance(residuals, share, usable, 0.2, 0.8)
         if not from_edges or math.isnan(at_edges):
             return seen, seen
         if is_ink_seen:  # ink is no noisier than plate
-            white, of_white = max(at_edges, seen), of_edges
+            white, white_share = max(at_edges, seen), edge_share
         else:
-            ink, of_ink = min(at_edges, seen), of_edges
+            ink, ink_share = min(at_edges, seen), edge_share
     if not is_linear_in_share:
-        of_ink = 0.0 if is_ink_seen else of_ink
-        of_white = 1.0 if is_white_seen else of_white
-    slope = (white - ink) / (of_white - of_ink)
+        ink_share = 0.0 if is_ink_seen else ink_share
+        white_share = 1.0 if is_white_seen else white_share
+    slope = (white - ink) / (white_share - ink_share)
     least_ink = (1.0 - _MAX_PLATE_IN_INK) * ink if is_ink_seen else floor
-    return max(ink - slope * of_ink, least_ink, floor), max(white + slope * (1.0 - of_white), floor)
+    return max(ink - slope * ink_share, least_ink, floor), max(
+        white + slope * (1.0 - white_share), floor
+    )
 
 
 @compiled

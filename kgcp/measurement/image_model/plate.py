@@ -1,4 +1,4 @@
-"""The plate and the rays: circles in metres, and where the pixels of a window meet them."""
+"""The circles of a plate, and where the rays of pixels meet the plate."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.pose import Pose
 from kgcp.targets.layout import Ring
 
-_SAME_PLACE = 1e-6  # of a radius
-EVEN = np.array([1.0, 0.0, 1.0])  # a blur that is spread evenly
+_SAME_DISTANCE = 1e-6  # relative to a circle's radius
+ISOTROPIC = np.array(
+    [1.0, 0.0, 1.0]
+)  # `blur_on_plate` of a blur that is the same in all directions
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,13 +28,13 @@ class Circles:
     signs: FloatArray  # (c,): +1: white within; −1: black within
 
     def part(self, which: slice) -> Circles:
-        """Return some of the circles."""
+        """Return a slice of the circles."""
         return Circles(self.centres_m[:, which], self.radii_m[which], self.signs[which])
 
 
 @cache
 def circles_of(rings: tuple[Ring, ...]) -> Circles:
-    """Return all circles of concentric rings: edges and dots."""
+    """Return all circles of concentric rings: for each the outer, the inner, and the dots."""
     centres: list[FloatArray] = []
     radii: list[float] = []
     signs: list[float] = []
@@ -46,14 +48,14 @@ def circles_of(rings: tuple[Ring, ...]) -> Circles:
 
 
 def plate_points(pose: Pose, rays: FloatArray) -> FloatArray:
-    """Return where the rays (6, n) of n pixels meet the plate (2, n) [m]."""
+    """Return the points (2, n) on the plate [m] that the rays (6, n) of pixels meet."""
     points = np.empty((2, rays.shape[1]))
-    _meet(pose.rotation, pose.translation_m, rays, points)
+    _intersect(pose.rotation, pose.translation_m, rays, points)
     return points
 
 
 @compiled
-def _meet(axes: FloatArray, offset: FloatArray, rays: FloatArray, points: FloatArray) -> None:
+def _intersect(axes: FloatArray, offset: FloatArray, rays: FloatArray, points: FloatArray) -> None:
     height, along = 0.0, np.zeros(2)
     for k in range(3):
         height += axes[k, 2] * offset[k]
@@ -67,13 +69,13 @@ def _meet(axes: FloatArray, offset: FloatArray, rays: FloatArray, points: FloatA
 
 
 def largest_metres_per_px(pose: Pose, rays: FloatArray) -> float:
-    """Return the largest length on the plate that a pixel with these rays (6, n) spans [m]."""
+    """Return the largest length on the plate that a pixel spans, of those with rays (6, n) [m]."""
     return math.sqrt(_largest_square(pose.rotation, pose.translation_m, rays))
 
 
 @compiled
 def _largest_square(axes: FloatArray, offset: FloatArray, rays: FloatArray) -> float:
-    """Return the largest square of the length on the plate along x or y of a raw pixel [m²]."""
+    """Return the largest squared length on the plate of a raw pixel's side, along x or y [m²]."""
     largest = 0.0
     for i in range(rays.shape[1]):
         xx, xy, yx, yy = _scales(axes, offset, rays[:, i])
@@ -85,7 +87,10 @@ def _largest_square(axes: FloatArray, offset: FloatArray, rays: FloatArray) -> f
 def _scales(
     axes: FloatArray, offset: FloatArray, ray: FloatArray
 ) -> tuple[float, float, float, float]:
-    """Return the metres on the plate along its x and y per raw pixel along x, y: xx, xy, yx, yy."""
+    """Return the metres on the plate, along its x or y, per raw pixel along x or y.
+
+    The order is xx, xy, yx, yy; the first letter is the plate's axis.
+    """
     facing = axes[0, 2] * ray[0] + axes[1, 2] * ray[1] + axes[2, 2]
     height = axes[0, 2] * offset[0] + axes[1, 2] * offset[1] + axes[2, 2] * offset[2]
     depth, scales = height / facing, np.empty((2, 2))
@@ -100,16 +105,16 @@ def _scales(
 def blur_on_plate(
     pose: Pose, ray: FloatArray, covariance: tuple[float, float, float], sd_m: float
 ) -> FloatArray:
-    """Return an image's blur on the plate: its covariance (3,) xx, xy, yy, in units of sd_m².
+    """Return the covariance (3,) of the blur on the plate: xx, xy, yy, in units of sd_m².
 
     Parameters
     ----------
     ray : (6,) array
-        Of a pixel on the plate, as in `Window`.
+        Ray of a pixel on the plate, as in `Window`.
     covariance : (3,) tuple
-        Of the blur: xx, yy, xy [px²].
+        Covariance of the blur in the image: xx, yy, xy [px²].
     sd_m : float
-        Largest standard deviation that it may have on the plate.
+        Upper bound of the blur's standard deviation on the plate.
     """
     a, b, c, d = _scales(pose.rotation, pose.translation_m, ray)
     xx, yy, xy = covariance
@@ -119,16 +124,19 @@ def blur_on_plate(
 
 
 @compiled
-def find_skips(centres_m: FloatArray, radii_m: FloatArray) -> tuple[FloatArray, IndexArray]:
-    """Return how far circles (c,) are out, and the next that may be in reach where one is not.
+def distances_and_group_ends(
+    centres_m: FloatArray, radii_m: FloatArray
+) -> tuple[FloatArray, IndexArray]:
+    """Return the centres' distances (c,) from the target's centre, and where similar circles end.
 
-    Dots of one ring are all as far from the target's centre.
+    The dots of a ring have the same radius and distance, so that they can be processed together:
+    the circles from c to ends[c] − 1 are similar.
     """
     count = len(radii_m)
-    out_m, beyond = np.sqrt(centres_m[0] ** 2 + centres_m[1] ** 2), np.empty(count, np.intp)
+    out_m, ends = np.sqrt(centres_m[0] ** 2 + centres_m[1] ** 2), np.empty(count, np.intp)
     for c in range(count - 1, -1, -1):
-        beyond[c] = c + 1
+        ends[c] = c + 1
         is_like_next = c + 1 < count and radii_m[c] == radii_m[c + 1]
-        if is_like_next and abs(out_m[c] - out_m[c + 1]) < _SAME_PLACE * radii_m[c]:
-            beyond[c] = beyond[c + 1]
-    return out_m, beyond
+        if is_like_next and abs(out_m[c] - out_m[c + 1]) < _SAME_DISTANCE * radii_m[c]:
+            ends[c] = ends[c + 1]
+    return out_m, ends

@@ -1,4 +1,4 @@
-"""Sums over arcs of edges, which tell how far residuals along them agree."""
+"""Sums over arcs of edges, from which the correlation of residuals along edges is estimated."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 def sums_over_arcs(
     of_own: FloatArray, of_all: FloatArray, score: FloatArray, weight: FloatArray, arc: IndexArray
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Return sums over arcs, and how many of them have pixels.
+    """Return two kinds of sums over the pixels of each arc, and the number of arcs with pixels.
 
-    Of the scores (n,) with some derivatives `of_own` (n, k): (arcs, k); and of the products of
-    these and of those `of_all` (n, p), weighted (n,): (arcs, k, p). `arc` (n,) is the number of
-    every pixel's arc.
+    The first are sums of the derivatives `of_own` (n, k) times the scores (n,): (arcs, k). The
+    second are sums of the products of `of_own` and `of_all` (n, p), times the weights (n,): (arcs,
+    k, p). `arc` (n,) is the arc number of every pixel.
     """
     count, own, room = arc.max() + 1, of_own.shape[1], of_all.shape[1]
     sums, products = np.zeros((count, own)), np.zeros((count, own, room))

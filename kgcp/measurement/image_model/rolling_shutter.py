@@ -1,8 +1,8 @@
-"""Rows that are exposed one after the other, while the scene turns about the camera.
+"""Rolling shutter: rows are exposed one after the other while the scene turns about the camera.
 
-The pose of a target is that of the moment at which the row of its centre is exposed. At a time τ
-after it, the scene has turned by Ω τ: a pixel looks along the ray d where, at the moment of the
-centre, it would have looked along d − (Ω × d) τ.
+The pose of a target refers to the moment at which the row of its centre is exposed. At a time τ
+later, the scene has turned by Ω τ. A pixel with the ray d then sees what the ray d − (Ω × d) τ
+would have seen at the reference moment.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from kgcp.measurement.plate_prior import SceneRotation
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RollingShutter:
-    """When the pixels of a window are exposed."""
+    """Exposure times of the pixels of a window, and the scene's rotation."""
 
-    # (n,): how much later every pixel is exposed than the row of the target's centre [s]
+    # (n,): time from the exposure of the row of the target's centre to that of each pixel [s]
     delay_s: FloatArray
     delay_s_px: float  # from one row to the next [s/px]
-    rotation: SceneRotation  # of the scene meanwhile
+    rotation: SceneRotation
 
     @classmethod
     def of(
         cls, camera: Camera, rows: FloatArray, centre_row: float, rotation: SceneRotation
     ) -> Self:
-        """Return the delays of pixels in the rows (n,) of a camera's frame."""
+        """Return the shutter for pixels in the rows (n,) of a camera's frame."""
         return cls((rows - centre_row) * _delay_s_px(camera), _delay_s_px(camera), rotation)
 
     def rays_at_one_moment(self, rays: FloatArray) -> FloatArray:
-        """Return where pixels would have looked, had all been exposed with the target's centre.
+        """Return the rays that see the same at the moment when the target's centre is exposed.
 
         Parameters
         ----------
         rays : (6, n) array
-            As of `Window.rays`.
+            As `Window.rays`.
 
         Returns
         -------
         (6, n) array
-            As `rays`; the derivatives are those along the moved rows.
+            As `rays`. The derivatives include the delay from row to row.
         """
         by_time = np.tensordot(self.rotation.velocity_rad_s, ray_motions(*rays[:2]), axes=(0, 1))
         moved = rays.copy()
@@ -54,12 +54,12 @@ class RollingShutter:
 
 
 def motion_per_row(camera: Camera, centre_px: FloatArray) -> FloatArray:
-    """Return by how much the image moves from one row to the next, per rotation of the scene.
+    """Return the motion of the image from one row to the next, per rate of rotation of the scene.
 
     Parameters
     ----------
     centre_px : (2,) array
-        Where in the raw image.
+        Position in the raw image.
 
     Returns
     -------
@@ -72,9 +72,9 @@ def motion_per_row(camera: Camera, centre_px: FloatArray) -> FloatArray:
 
 
 def ray_motions(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return how rays (x, y, 1) move where the scene turns.
+    """Return the velocity of rays (x, y, 1) when the scene turns.
 
-    That is Ω × d for the rays d, brought back to the third component 1.
+    It is Ω × d for the rays d, projected so that the third component stays 1.
 
     Parameters
     ----------
@@ -83,12 +83,12 @@ def ray_motions(x: FloatArray, y: FloatArray) -> FloatArray:
     Returns
     -------
     (2, 3, n) array
-        Derivatives of x and y by time, by each component of Ω [rad/s].
+        Velocities of x and y per component of Ω [rad/s].
     """
     one = np.ones_like(x)
     return np.array([[-x * y, one + x * x, -y], [-one - y * y, x * y, x]])
 
 
 def _delay_s_px(camera: Camera) -> float:
-    """Return how much later a row is exposed than the one before it [s/px]."""
+    """Return the time between the exposures of successive rows [s/px]."""
     return camera.readout_s / (camera.height - 1)

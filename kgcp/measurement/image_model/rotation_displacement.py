@@ -1,13 +1,14 @@
-"""What an unknown rotation of the scene, while a rolling shutter reads it, makes of a pose.
+"""Errors of a pose due to an unknown rotation of the scene during a rolling-shutter readout.
 
 Rows that are exposed later are displaced, as if the image were sheared. The image of a plate that
-nearly faces the camera depends on the square of its tilt: a shear of 0.4 % looks like a tilt of 5°.
-So the pose does not follow the rotation linearly, and derivatives do not give its mean square
-displacement. With them, squared Mahalanobis distances of poses had a median of 15 in simulated
-flights whose motion was not known (`benchmarks.accuracy.presets`, preset `rolling`).
+almost faces the camera depends on the square of its tilt: a shear of 0.4 % looks like a tilt of 5°.
+So the pose is not a linear function of the rotation, and its mean square displacement does not
+follow from derivatives. When it was computed from them, squared Mahalanobis distances of poses had
+a median of 15 in simulated flights with unknown motion (`benchmarks.accuracy.presets`, preset
+`rolling`).
 
-The displacement is found for some rotations instead. For each, it is known which edges the camera
-would have seen without it; the pose that fits them best is searched for.
+Instead, the displacement is computed for a set of rotations. For each it is known where the camera
+would have seen the edges without it, and the pose that fits these best is searched.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.measurement.image_model.plate import Circles
 from kgcp.measurement.image_model.rolling_shutter import ray_motions
 
-# Rotations (12, 3): with weights of 1/20, sums over them are the means of all polynomials up to the
-# fifth degree in three independent unit normal variables. The vertices of an icosahedron are evenly
-# spread; the squared radius of 5 gives the second moments, 12/20 · 5/3 = 1, and the fourth. The
-# thirteenth point, without a rotation, displaces nothing.
+# A cubature rule: 12 rotations (12, 3) whose sums with weights of 1/20 are the means of all
+# polynomials up to degree five in three independent unit normal variables. The directions are the
+# vertices of an icosahedron. The squared radius of 5 makes the second moments 12/20 · 5/3 = 1, and
+# the fourth ones correct, too. The rule's thirteenth point is no rotation, which displaces nothing.
 _GOLDEN = 0.5 * (1.0 + math.sqrt(5.0))
 _VERTICES = np.array(
     [
@@ -36,36 +37,37 @@ _VERTICES = np.array(
 )
 _ROTATIONS = math.sqrt(5.0) * _VERTICES / math.hypot(1.0, _GOLDEN)
 _WEIGHT = 1.0 / 20.0
-# Around a circle, shears displace edges by the second harmonic, and tilts by the first four.
+# Points per circle. Around a circle, shears displace edges by the second harmonic, and tilts by the
+# first four.
 _POINTS, _POINTS_OF_DOTS = 24, 8
-_DOT_SHARE = 0.3  # of the largest radius, below which a circle is a dot
-_STEPS, _SETTLED = 20, 1e-5  # the latter in radians, and of the depth
-# What a step changes at most, in radians and of the depth: of a plate that faces the camera, images
-# hardly depend on the tilt, so that derivatives alone ask for any.
-_LARGEST_STEP = 0.1
-_RIDGE = 1e-9  # of the diagonal: keeps the equations of such a plate regular
+_DOT_SHARE = 0.3  # circles with smaller radii, relative to the largest one, are dots
+_MAX_STEPS, _SETTLED = 20, 1e-5  # a step below the latter, in radians and of the depth, is the last
+# Largest step, in radians and relative to the depth. The image of a plate that faces the camera
+# hardly depends on its tilt, so that the equations alone may ask for steps of any size.
+_MAX_STEP = 0.1
+_RIDGE = 1e-9  # relative to the diagonal; keeps the equations of such a plate regular
 
 
 def mean_square_displacement(
     pose: Pose, circles: Circles, delay_s: float, sd_rad_s: float
 ) -> FloatArray:
-    """Return the mean square (6, 6) of what unknown rotations displace a pose by.
+    """Return the mean square (6, 6) of the displacement of a pose by unknown rotations.
 
     Parameters
     ----------
     pose : Pose
-        As it was measured, without any rotation.
+        The pose measured under the assumption of no rotation.
     circles : Circles
-        Those of the plate that were measured, dots included: without, nothing tells the heading.
+        The measured circles of the plate, including dots: without dots the heading is undetermined.
     delay_s : float
-        How much later a ray is exposed than the target's centre, per unit of its y.
+        Delay of a ray's exposure relative to the target's centre, per unit of its normalised y [s].
     sd_rad_s : float
-        Standard deviation of the rotation about each of the camera's axes.
+        Standard deviation of the rate of rotation about each camera axis.
 
     Returns
     -------
     (6, 6) array
-        Of translation [m] and rotation vector [rad], left perturbation in the camera frame.
+        For translation [m] and rotation vector [rad], left perturbation in the camera frame.
     """
     off = pose_displacements(pose, circles, delay_s, sd_rad_s * _ROTATIONS)
     return np.asarray(_WEIGHT * off.T @ off)
@@ -74,11 +76,12 @@ def mean_square_displacement(
 def pose_displacements(
     pose: Pose, circles: Circles, delay_s: float, rotations_rad_s: FloatArray
 ) -> FloatArray:
-    """Return by how much (k, 6) poses of known rotations (k, 3) are off the one of none.
+    """Return the displacements (k, 6) from the pose without a rotation to those with rotations.
 
-    Edges count by their lengths, and square to themselves only: Gauss-Newton steps compare points
-    that have the same place on their circle. Steps are limited, and so are displacements, however
-    fast the rotations.
+    Gauss-Newton steps minimise the distances of edge points, only perpendicular to the edges and
+    weighted by the lengths that the points represent. Corresponding points have the same position
+    on their circle. Steps are limited in size and number, so displacements stay finite however fast
+    the rotations (k, 3) are.
     """
     points_m, tangents, lengths_m = _edges_of(circles)
     seen = pose.transform(points_m)
@@ -88,7 +91,7 @@ def pose_displacements(
     targets = rays - by_time * delays_s[:, None]
     turns = np.repeat(np.eye(3)[None], len(targets), axis=0)
     moves_m = np.zeros((len(targets), 3))
-    for _ in range(_STEPS):
+    for _ in range(_MAX_STEPS):
         axes = turns @ pose.rotation[:, :2]
         on_plate = points_m @ np.swapaxes(axes, 1, 2)
         centres_m = pose.translation_m + moves_m
@@ -110,7 +113,7 @@ def pose_displacements(
         steps = np.linalg.solve(normal, weighted @ off[..., None])[..., 0]
         shifts = np.linalg.norm(steps[:, :3], axis=1) / centres_m[:, 2]
         sizes = np.maximum(np.linalg.norm(steps[:, 3:], axis=1), shifts)
-        steps *= (_LARGEST_STEP / np.maximum(sizes, _LARGEST_STEP))[:, None]
+        steps *= (_MAX_STEP / np.maximum(sizes, _MAX_STEP))[:, None]
         moves_m += steps[:, :3]
         turns = np.array([rotation_about(step) for step in steps[:, 3:]]) @ turns
         if sizes.max() < _SETTLED:
@@ -119,7 +122,7 @@ def pose_displacements(
 
 
 def _edges_of(circles: Circles) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return points (n, 2) of circles [m], tangents (n, 2), and lengths (n,) they stand for [m]."""
+    """Return points of circles (n, 2) [m], tangents (n, 2), and the lengths they represent [m]."""
     points, tangents, lengths = [], [], []
     least_m = _DOT_SHARE * float(circles.radii_m.max())
     for centre_m, radius_m in zip(circles.centres_m.T, circles.radii_m.tolist(), strict=True):
@@ -133,7 +136,7 @@ def _edges_of(circles: Circles) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _rotation_vectors(turns: FloatArray) -> FloatArray:
-    """Return the vectors (k, 3) of rotations (k, 3, 3) by less than 180° [rad]."""
+    """Return the rotation vectors (k, 3) [rad] of rotations (k, 3, 3) by less than 180°."""
     twice = np.stack([turns[:, j, i] - turns[:, i, j] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
     sine = 0.5 * np.linalg.norm(twice, axis=1)
     angle = np.arctan2(sine, 0.5 * (np.trace(turns, axis1=1, axis2=2) - 1.0))

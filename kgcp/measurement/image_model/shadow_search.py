@@ -1,7 +1,8 @@
-"""Straight edges of shadows, found in grey values of ink and plate clear of the plate's own edges.
+"""Search for straight shadow edges, in grey values of ink and plate clear of the plate's own edges.
 
-The search takes the step that explains most of how the values vary, or the strip between two edges,
-adjusts it together with all edges found before, and goes on in what is left.
+The search finds the step, or the strip between two edges, that explains most of the variation of
+the grey values. It adjusts this together with all edges found before, and continues with the
+residuals.
 """
 
 from __future__ import annotations
@@ -22,63 +23,65 @@ from kgcp.measurement.image_model.shadow_edges import (
     ShadowEdges,
 )
 
-_ENOUGH_EDGES = 4  # with so many, no further ones are looked for
-_DIRECTIONS, _BORDERS = 36, 61  # of steps that are tried, over half a turn and across the plate
-_FEWEST_PIXELS = 12  # on either side of a step, of ink or plate
-# Of the variance, that a step must explain, and of what others have left. Under an edge and an
-# antenna's shadow, nine of ten rings had 0.80 of the rest explained by what is there, or more.
-_LEAST_EXPLAINED, _LEAST_EXPLAINED_OF_REST = 0.5, 0.7
-_BY_STRIP = 0.9  # what a strip explains counts as so much: it has one border more
-# Noise of grey values, of the contrast, at the least: what steps do not explain is more than noise,
-# and taken for it, it would outweigh all that is known beforehand of a penumbra.
-_LEAST_NOISE = 0.01
-# σ of a penumbra at the start, of the plate's radius, and within a strip of its breadth; limits of
-# its logarithm [px]
+_ENOUGH_EDGES = 4  # the search ends with so many
+_DIRECTIONS, _BORDERS = 36, 61  # tried over half a turn, and across the plate
+_MIN_PIXELS = 12  # of ink or of plate, on either side of a step
+# Share of the variance that the first step must explain, and share of the remaining variance that
+# each further one must explain. On nine of ten rings under both a shadow edge and an antenna's
+# shadow, the second of these explained 0.80 of the rest or more.
+_MIN_EXPLAINED, _MIN_EXPLAINED_OF_REST = 0.5, 0.7
+_STRIP_FACTOR = 0.9  # on what a strip explains, because it has one border more than a step
+# Least noise of grey values, relative to the contrast. Residuals of the steps are more than noise.
+# If they were weighted by the noise alone, they would outweigh the prior of the penumbra.
+_MIN_NOISE = 0.01
+# Initial σ of a penumbra: relative to the plate's radius, and in a strip at most so much of its
+# width. Then limits of its logarithm [px].
 _FIRST_WIDTH, _WIDTH_IN_STRIP = 0.06, 0.3
-_LEAST_LOG_WIDTH, _MOST_LOG_WIDTH = -1.0, 6.0
+_MIN_LOG_WIDTH, _MAX_LOG_WIDTH = -1.0, 6.0
 _STEPS, _TRIALS, _FIRST_DAMPING, _SETTLED = 12, 4, 1e-3, 1e-3
-_ALMOST_NOTHING = 1e-6  # of full scale
-# Change of ink by that of plate: shade takes from both what they have, a highlight adds to both. On
-# a ring of R 29 px, a strip of 5 px seemed to brighten ink by 0.14 of what it took from the plate.
-_LEAST_BY_INK, _MOST_BY_INK = -0.2, 0.6
-_BURNT = 0.02  # of the contrast: so near to the limit, white may be anything above
-# Level of ink in the sun, of the plate's, before any tone curve: 0.05 to 0.11 where white is burnt.
-# Under a highlight ink is brighter, in one case by 0.15.
-_MOST_INK = 0.13
+_TINY_LEVEL = 1e-6  # of full scale
+# Range of the change of ink divided by that of plate at an edge. Shade reduces both in proportion,
+# a highlight adds to both. The range includes small negative values: on a ring of R 29 px, a strip
+# of 5 px seemed to brighten ink by 0.14 of what it took from the plate.
+_MIN_INK_RATIO, _MAX_INK_RATIO = -0.2, 0.6
+_BURNT_MARGIN = 0.02  # relative to the contrast; white so close to the limit may be burnt
+# Largest level of sunlit ink relative to that of the plate, in linear light. It is 0.05 to 0.11
+# where white is burnt. Under a highlight ink is brighter, in one case by 0.15.
+_MAX_INK = 0.13
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FlatPixels:
+class PlateauPixels:
     """Pixels of ink and plate that are clear of edges."""
 
     offsets: FloatArray  # (2, n): from the target's centre [px]
     kind: IndexArray  # (n,): 0 for ink, 1 for plate
     levels: FloatArray  # (n,): grey values
-    high: float  # grey value from which on they are clipped
+    high: float  # grey value from which on pixels are clipped
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SeenShadows:
-    """Straight edges of shadows, in grey values."""
+class FoundShadows:
+    """Straight shadow edges, in terms of grey values."""
 
-    lit: FloatArray  # (2,): ink and plate before all edges
+    lit: FloatArray  # (2,): levels of ink and plate in the light, without any edge
     edges: ShadowEdges
 
     def is_burnt(self, high: float) -> bool:
-        """Tell whether the plate in the light is clipped, at the grey value `high`."""
+        """Tell whether the plate in the light is clipped at the grey value `high`."""
         ink, plate = self.lit.tolist()
-        return bool(plate > high - _BURNT * (plate - ink))
+        return bool(plate > high - _BURNT_MARGIN * (plate - ink))
 
 
-def find_shadows(flat: FlatPixels, tone: Tone) -> list[SeenShadows]:
-    """Return straight edges that explain most of how grey values vary, the fewest first.
+def find_shadows(flat: PlateauPixels, tone: Tone) -> list[FoundShadows]:
+    """Return sets of straight edges that explain the variation of the grey values, smallest first.
 
-    Each adds a step or a strip to the one before; there is none if nothing explains most. There are
-    pixels of both kinds.
+    Each set adds a step or a strip to the one before. The list is empty if no first step explains
+    enough. `flat` must contain pixels of both kinds.
     """
     means = np.array([flat.levels[flat.kind == kind].mean() for kind in (0, 1)])
     sd = _noise_of(flat, float(means[1] - means[0]))
-    seen, found = SeenShadows(means, NO_EDGES), list[SeenShadows]()
+    seen, found = FoundShadows(means, NO_EDGES), list[FoundShadows]()
     rest = _rest(seen, flat, sd)
     while len(seen.edges.rows) < _ENOUGH_EDGES and not (found and rest @ rest < len(rest)):
         start = _with_best_step(seen, flat, rest, sd)
@@ -86,7 +89,7 @@ def find_shadows(flat: FlatPixels, tone: Tone) -> list[SeenShadows]:
             break
         further, after = _adjusted(start, flat, sd)
         explained = 1.0 - float(after @ after) / float(rest @ rest)
-        least = _LEAST_EXPLAINED_OF_REST if found else _LEAST_EXPLAINED
+        least = _MIN_EXPLAINED_OF_REST if found else _MIN_EXPLAINED
         if explained < least or not _may_be_shade(further, flat.high, tone):
             break
         seen, rest = further, after
@@ -94,45 +97,46 @@ def find_shadows(flat: FlatPixels, tone: Tone) -> list[SeenShadows]:
     return found
 
 
-def _noise_of(flat: FlatPixels, contrast: float) -> FloatArray:
-    """Return the standard deviation of grey values of ink and plate (2,)."""
+def _noise_of(flat: PlateauPixels, contrast: float) -> FloatArray:
+    """Return the noise of ink and plate (2,), from differences of successive pixels."""
     differences = (np.abs(np.diff(flat.levels[flat.kind == kind])) for kind in (0, 1))
-    least = max(_LEAST_NOISE * contrast, _ALMOST_NOTHING)
+    least = max(_MIN_NOISE * contrast, _TINY_LEVEL)
     return np.array([max(float(np.median(each)), least) for each in differences])
 
 
-def _rest(seen: SeenShadows, flat: FlatPixels, sd: FloatArray) -> FloatArray:
-    """Return what shadows leave of the grey values (n,), in units of the noise."""
+def _rest(seen: FoundShadows, flat: PlateauPixels, sd: FloatArray) -> FloatArray:
+    """Return the residuals of the grey values (n,), in units of the noise."""
     added, _ = seen.edges.added_with_gradient(flat.offsets)
     ink, plate = seen.lit[:, None] + added
     return np.asarray((flat.levels - np.where(flat.kind, plate, ink)) / sd[flat.kind])
 
 
-def _may_be_shade(seen: SeenShadows, high: float, tone: Tone) -> bool:
-    """Tell whether shade or a highlight can make all edges: not what is brighter on ink alone.
+def _may_be_shade(seen: FoundShadows, high: float, tone: Tone) -> bool:
+    """Tell whether shade or highlights can cause all edges.
 
-    Where white is burnt, shade need not show on it but on ink, which is dark without a highlight.
+    Ink and plate must change in the same sense. If white is burnt, shade need not show on the
+    plate, but it must show on ink, and ink must be as dark as it is without a highlight.
     """
     if not max(float(seen.lit[0]), 0.0) < seen.lit[1]:
         return False
     by_ink, by_plate = seen.edges.rows[:, INK], seen.edges.rows[:, PLATE]
-    ratios = by_ink / np.where(by_plate == 0.0, _ALMOST_NOTHING, by_plate)
-    if np.all((ratios > _LEAST_BY_INK) & (ratios < _MOST_BY_INK)):
+    ratios = by_ink / np.where(by_plate == 0.0, _TINY_LEVEL, by_plate)
+    if np.all((ratios > _MIN_INK_RATIO) & (ratios < _MAX_INK_RATIO)):
         return True
     light = decoded(np.maximum(seen.lit, 0.0), Tone.SRGB if tone.is_unknown else tone)
     ink, plate = light.tolist()
-    against = by_plate * np.sign(by_ink) < -_BURNT
+    against = by_plate * np.sign(by_ink) < -_BURNT_MARGIN
     shows_on_ink = by_ink * (by_ink + by_plate) > 0.0
-    is_dark = seen.is_burnt(high) and ink < _MOST_INK * plate
+    is_dark = seen.is_burnt(high) and ink < _MAX_INK * plate
     return bool(is_dark and np.all(shows_on_ink & ~against))
 
 
 def _adjusted(
-    start: SeenShadows, flat: FlatPixels, sd: FloatArray
-) -> tuple[SeenShadows, FloatArray]:
+    start: FoundShadows, flat: PlateauPixels, sd: FloatArray
+) -> tuple[FoundShadows, FloatArray]:
     """Adjust levels and edges to the grey values (Levenberg–Marquardt).
 
-    Also return what is left of these (n,), in units of the noise.
+    Returned are the result and its residuals (n,), in units of the noise.
     """
     by_level = np.stack([(flat.kind == kind) / sd[kind] for kind in (0, 1)])
     seen, rest, damping = start, _rest(start, flat, sd), _FIRST_DAMPING
@@ -159,21 +163,21 @@ def _adjusted(
     return seen, rest
 
 
-def _moved(seen: SeenShadows, step: FloatArray) -> SeenShadows:
+def _moved(seen: FoundShadows, step: FloatArray) -> FoundShadows:
     rows = seen.edges.rows + step[2:].reshape(-1, 5)
-    rows[:, LOG_WIDTH] = np.clip(rows[:, LOG_WIDTH], _LEAST_LOG_WIDTH, _MOST_LOG_WIDTH)
-    return SeenShadows(seen.lit + step[:2], replace(seen.edges, rows=rows))
+    rows[:, LOG_WIDTH] = np.clip(rows[:, LOG_WIDTH], _MIN_LOG_WIDTH, _MAX_LOG_WIDTH)
+    return FoundShadows(seen.lit + step[:2], replace(seen.edges, rows=rows))
 
 
 def _with_best_step(
-    seen: SeenShadows, flat: FlatPixels, rest: FloatArray, sd: FloatArray
-) -> SeenShadows | None:
-    """Add the step or strip that explains most of what is left; None if nothing explains any.
+    seen: FoundShadows, flat: PlateauPixels, rest: FloatArray, sd: FloatArray
+) -> FoundShadows | None:
+    """Add the step or strip that explains most of the residuals; None if there is none.
 
-    Edges that bound a shade alone come first, and darken.
+    In the result, single edges come first, each with its shade beyond it.
     """
     reach_px = float(np.hypot(*flat.offsets).max())
-    in_sun = seen.edges.sun_left(flat.offsets) > 0.5  # elsewhere, another shade takes nothing
+    in_sun = seen.edges.sunlit_share(flat.offsets) > 0.5  # another shade has no effect elsewhere
     offsets = np.ascontiguousarray(flat.offsets[:, in_sun])
     gain, angle, first, last, *in_noise = _best_step(
         offsets, rest[in_sun], flat.kind[in_sun], reach_px
@@ -183,25 +187,26 @@ def _with_best_step(
     borders_px, step = np.linspace(-reach_px, reach_px, _BORDERS), np.array(in_noise) * sd
     near_px, far_px = borders_px[[first, last]].tolist()
     width_px = max(1.0, _FIRST_WIDTH * reach_px)
-    rows, alone, lit = seen.edges.rows, seen.edges.alone_count, seen.lit
+    rows, singles, lit = seen.edges.rows, seen.edges.single_count, seen.lit
     if last < _BORDERS - 1:
         log_width = math.log(min(width_px, max(1.0, _WIDTH_IN_STRIP * (far_px - near_px))))
         sides = (angle, near_px, log_width, *step), (angle, far_px, log_width, *-step)
-        return SeenShadows(lit, ShadowEdges(np.vstack((rows, sides)), alone))
-    if step.sum() > 0.0:  # the shade lies the other way
+        return FoundShadows(lit, ShadowEdges(np.vstack((rows, sides)), singles))
+    if step.sum() > 0.0:  # the shade is on the other side
         angle, near_px, lit, step = angle + math.pi, -near_px, lit + step, -step
     row = np.array((angle, near_px, math.log(width_px), *step))
-    return SeenShadows(lit, ShadowEdges(np.insert(rows, alone, row, axis=0), alone + 1))
+    return FoundShadows(lit, ShadowEdges(np.insert(rows, singles, row, axis=0), singles + 1))
 
 
 @compiled
 def _best_step(
     offsets: FloatArray, values: FloatArray, kind: IndexArray, reach_px: float
 ) -> tuple[float, float, int, int, float, float]:
-    """Return the step between two borders that explains most of values (n,).
+    """Return the strip between two borders that explains most of the values (n,).
 
-    Of squares, so much that their sum is less by it; the direction; the two borders, of which the
-    last one ends the plate; and by how much ink and plate differ between them.
+    Returned are by how much it reduces the sum of squares, its direction [rad], the numbers of its
+    two borders, and the differences of ink and of plate in it from outside. If the second border is
+    the last one, the strip is a step: it extends to the end of the plate.
     """
     best = (0.0, 0.0, 0, 0, 0.0, 0.0)
     bins = _BORDERS - 1
@@ -221,7 +226,7 @@ def _best_step(
             for last in range(first + 1, bins + 1):
                 ink, by_ink = _difference(sums[0, 0], sums[0, 1], first, last)
                 plate, by_plate = _difference(sums[1, 0], sums[1, 1], first, last)
-                gain = (by_ink + by_plate) * (_BY_STRIP if last < bins else 1.0)
+                gain = (by_ink + by_plate) * (_STRIP_FACTOR if last < bins else 1.0)
                 if gain > best[0]:
                     best = (gain, angle, first, last, ink, plate)
     return best
@@ -229,14 +234,14 @@ def _best_step(
 
 @compiled
 def _difference(count: FloatArray, total: FloatArray, first: int, last: int) -> tuple[float, float]:
-    """Return the mean between two borders less that of all else, and how much that explains.
+    """Return the mean between two borders minus that of the rest, and how much that explains.
 
-    Both are 0 where few values lie on either side.
+    Both are 0 if there are too few values inside or outside.
     """
-    within = count[last] - count[first]
-    beside = count[-1] - within
-    if min(within, beside) < _FEWEST_PIXELS:
+    inside = count[last] - count[first]
+    outside = count[-1] - inside
+    if min(inside, outside) < _MIN_PIXELS:
         return 0.0, 0.0
-    sum_within = total[last] - total[first]
-    difference = sum_within / within - (total[-1] - sum_within) / beside
-    return difference, difference * difference * within * beside / count[-1]
+    sum_inside = total[last] - total[first]
+    difference = sum_inside / inside - (total[-1] - sum_inside) / outside
+    return difference, difference * difference * inside * outside / count[-1]

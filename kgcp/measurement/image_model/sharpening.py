@@ -1,4 +1,4 @@
-"""In-camera sharpening: what an unsharp mask adds, at the modelled pixels alone."""
+"""In-camera sharpening by an unsharp mask, computed at the modelled pixels only."""
 
 from __future__ import annotations
 
@@ -12,47 +12,47 @@ import numpy.typing as npt
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray, SingleArray
 
-_LAYERS = 16  # room for all rows that are sharpened: a full vector of the processor
-_TAPS = 7  # of the mask: 2.5 σ to either side, if σ is 1.2 px
+_LAYERS = 16  # rows of a Jacobian that are sharpened together: a full vector
+_TAPS = 7  # length of the kernel: 2.5 σ on either side for σ = 1.2 px
 
 _NOTHING = np.empty(0)
 
 NumberArray = npt.NDArray[np.int32]
 _Passes = tuple[NumberArray, NumberArray, FloatArray]
-"""What both passes add up, and their weights; see `Mask`."""
+"""`along_rows`, `along_columns` and `kernel` of a `Mask`."""
 _Stage = tuple[FloatArray, FloatArray, float]
-"""What other pixels add to the two first rows when they are smoothed (n,), and the strength."""
+"""Contributions of the other pixels to the first two rows when smoothed (n,), and the strength."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mask:
     """An unsharp mask over a window of which n pixels are modelled.
 
-    The mask is separable. Its first pass, along rows, makes the m values that the second one, along
-    columns, needs; both draw on the modelled pixels alone. All others stay as they are, between ink
-    and plate.
+    The Gaussian is separable. The first pass, along rows, computes the m values that the second
+    pass, along columns, needs. Both use only modelled pixels. The other pixels are taken as
+    constant mixtures of ink and plate; their contribution is precomputed.
     """
 
-    # (m, 7): what the first pass adds up: modelled pixels by number; n: none
+    # (m, 7): modelled pixels that are summed in the first pass, by number; n stands for none
     along_rows: NumberArray
-    # (n, 7): what the second pass adds up for each modelled pixel; m: nothing
+    # (n, 7): results of the first pass that are summed for each modelled pixel; m stands for none
     along_columns: NumberArray
-    kernel: FloatArray  # (7,): weights of either pass, which add up to 1
-    # (n,): what part of the smoothed value the others are, at each modelled pixel
+    kernel: FloatArray  # (7,): weights of either pass; their sum is 1
+    # (n,): weight of ink and of plate in other pixels in the smoothed value of each modelled pixel
     ink: FloatArray
     plate: FloatArray
 
     def detail(
         self, values: FloatArray, ink: float | FloatArray, plate: float | FloatArray
     ) -> FloatArray:
-        """Return what the mask adds at full strength (n,).
+        """Return what the mask adds at a strength of 1 (n,).
 
         Parameters
         ----------
         values : (n,) array
-            Of the modelled pixels.
+            Values of the modelled pixels.
         ink, plate : float or (n,) array
-            Values of the others, about each modelled pixel.
+            Values of ink and plate in the other pixels, around each modelled pixel.
         """
         smooth = ink * self.ink + plate * self.plate
         _add_smooth_twice(values, self.along_rows, self.along_columns, self.kernel, smooth)
@@ -67,14 +67,15 @@ class Mask:
     ) -> None:
         """Sharpen some rows of a Jacobian (…, n) in place.
 
-        In single precision, which is enough for derivatives.
+        It is done in single precision, which is enough for derivatives.
 
         Parameters
         ----------
         rows : (k,) array of int
-            At most 16. The first two are the derivatives by what ink and plate are.
+            At most 16 rows. The first two are the derivatives by the levels of ink and plate.
         others : (2,) tuple
-            By how much the pixels that are not modelled change with ink and with plate.
+            Derivatives of the pixels that are not modelled: of ink by its level, of plate by its
+            level.
         """
         of_others = others[0] * self.ink, others[1] * self.plate
         unsharpened = self.ink, self.plate, 0.0
@@ -92,23 +93,23 @@ class Mask:
         others: tuple[float, float],
         strength: float,
     ) -> None:
-        """Sharpen in the light, carry to grey values along a curve, and sharpen those.
+        """Sharpen in linear light, convert to grey values by a curve, and sharpen again.
 
-        All rows of a Jacobian (…, n) are carried in place, but only those named are sharpened.
+        All rows of a Jacobian (…, n) are converted in place, but only the named ones are sharpened.
 
         Parameters
         ----------
         rows : (k,) array of int
             As for `sharpen`.
         rare_rows : (m,) array of int
-            Others that are sharpened where they are not 0 altogether, as mostly they are.
+            Further rows, which are sharpened only if they are not all 0; mostly they are.
         in_light : float and (n,) array
-            Strength in the light, and what the mask adds there at full strength: the values of the
-            last of these rows. Empty: none is.
+            Strength in linear light, and what the mask adds there at a strength of 1: these are the
+            values of the last of `rows`. Empty if there is no such row.
         slope : (n,) array
-            Of the curve; empty: there is none.
+            Derivative of the curve; empty if there is none.
         others, strength
-            As for `sharpen`, of the grey values.
+            As for `sharpen`, for the grey values.
         """
         before, detail = in_light
         of_others = others[0] * self.ink, others[1] * self.plate
@@ -124,16 +125,16 @@ class Mask:
 def unsharp_mask(
     shape: tuple[int, int], index: IndexArray, share: FloatArray, sigma_px: float
 ) -> Mask:
-    """Return the mask of a Gaussian of this σ [px]; the window's border is repeated beyond it.
+    """Return the mask with a Gaussian of this σ [px]; border pixels are repeated beyond the window.
 
     Parameters
     ----------
     shape : (2,) tuple of int
         Rows and columns of the window.
     index : (n,) array of int
-        The modelled pixels in the flattened window.
+        Indices of the modelled pixels in the flattened window.
     share : (rows · columns,) array
-        Where all other pixels are between ink, 0, and plate, 1.
+        White share of all pixels: 0 for ink, 1 for plate. Used for those that are not modelled.
     """
     along_rows, along_columns = _gather(index, *shape)
     kernel = _gaussian(sigma_px)
@@ -146,7 +147,7 @@ def unsharp_mask(
 
 @lru_cache(maxsize=8)
 def _gaussian(sigma_px: float) -> FloatArray:
-    """Return the weights (7,) of either pass."""
+    """Return the weights (7,) of one pass."""
     steps = np.arange(_TAPS) - _TAPS // 2
     kernel = np.exp(-0.5 * (steps / sigma_px) ** 2)
     return np.asarray(kernel / kernel.sum())
@@ -160,10 +161,11 @@ def _filtered(image: FloatArray, kernel: FloatArray) -> FloatArray:
 
 @compiled
 def _gather(index: IndexArray, height: int, width: int) -> tuple[NumberArray, NumberArray]:
-    """Return what the two passes add up, for the pixels (n,) of a window."""
+    """Return `along_rows` and `along_columns` of the mask for the pixels (n,) of a window."""
     reach, count = _TAPS // 2, len(index)
-    number = np.full((height, width), count, np.int32)  # of a modelled pixel
-    between = np.full((height, width), -2, np.int32)  # of a value between the passes; −1: not yet
+    number = np.full((height, width), count, np.int32)  # of the modelled pixel
+    # number of the value between the passes; −2: not needed, −1: not numbered yet
+    between = np.full((height, width), -2, np.int32)
     for i in range(count):
         row, column = index[i] // width, index[i] % width
         number[row, column] = i
@@ -199,7 +201,7 @@ def _add_smooth_twice(
     kernel: FloatArray,
     smooth: FloatArray,
 ) -> None:
-    """Add what both passes make of values (n,); without those of pixels that are not modelled."""
+    """Add the smoothed values (n,) of modelled pixels, without the contribution of the others."""
     modelled, between = np.empty(len(values) + 1), np.zeros(len(along_rows) + 1)
     modelled[:-1], modelled[-1] = values, 0.0
     _add_smooth(modelled, along_rows, kernel, between)
@@ -229,7 +231,7 @@ def _sharpen_twice(
 ) -> None:
     """Sharpen rows, replace the last one by `detail`, multiply by `slope`, and sharpen again.
 
-    With all rows of a pixel side by side: so vectors of the processor go across rows.
+    All rows of a pixel are stored side by side, so that vectors go across rows.
     """
     layers = np.zeros((jacobian.shape[1] + 1, _LAYERS), np.float32)
     _stack(jacobian, rows, layers)
@@ -254,7 +256,7 @@ def _carry_others(
     slope: FloatArray,
     strength: float,
 ) -> None:
-    """Carry all rows but some along the curve, and sharpen the rare ones, one by one."""
+    """Convert all rows but `rows` by the curve, and sharpen the rare ones, one by one."""
     is_other, is_rare = np.ones(len(jacobian), np.bool_), np.zeros(len(jacobian), np.bool_)
     is_other[rows] = False
     for row in rare_rows:
@@ -295,7 +297,7 @@ def _sharpen_layers(layers: SingleArray, passes: _Passes, stage: _Stage) -> None
 
 @compiled
 def _stack(jacobian: FloatArray, rows: IndexArray, layers: SingleArray) -> None:
-    """Put all rows' values of a pixel side by side, for vectors across rows."""
+    """Copy rows to layers: the values of a pixel side by side."""
     for i in range(jacobian.shape[1]):
         for k in range(len(rows)):
             layers[i, k] = jacobian[rows[k], i]
@@ -305,7 +307,7 @@ def _stack(jacobian: FloatArray, rows: IndexArray, layers: SingleArray) -> None:
 def _smooth_layers(
     source: SingleArray, at: NumberArray, kernel: SingleArray, out: SingleArray
 ) -> None:
-    """Fill in what `_add_smooth` adds, for every layer."""
+    """Fill in the weighted sums of `_add_smooth` for every layer."""
     farthest, farther, far, middle = kernel[0], kernel[1], kernel[2], kernel[3]
     for i in range(at.shape[0]):
         a, b, c, d, e, f, g = at[i, 0], at[i, 1], at[i, 2], at[i, 3], at[i, 4], at[i, 5], at[i, 6]
@@ -326,9 +328,9 @@ def _add_detail(
     strength: float,
     layers: SingleArray,
 ) -> None:
-    """Add to every layer what smoothing takes away.
+    """Sharpen every layer: add the difference from its smoothed values, times the strength.
 
-    `ink` and `plate` (n,) are what the other pixels add to the first two of what is smooth.
+    `ink` and `plate` (n,) are the contributions of other pixels to the smoothed first two layers.
     """
     own, taken = np.float32(1.0 + strength), np.float32(strength)
     values, smooth_values = layers.reshape(-1), smooth.reshape(-1)
@@ -349,7 +351,7 @@ def _multiply(layers: SingleArray, slope: FloatArray) -> None:
 
 @compiled
 def _unstack(layers: SingleArray, rows: IndexArray, jacobian: FloatArray) -> None:
-    """Put the values of a pixel back into their rows."""
+    """Copy layers back to their rows."""
     for i in range(jacobian.shape[1]):
         for k in range(len(rows)):
             jacobian[rows[k], i] = layers[i, k]

@@ -1,4 +1,4 @@
-"""The pixels around one target, and all that the camera says about them once and for all."""
+"""The pixels around one target, with their rays: all that does not depend on the pose."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ _UNIT_CIRCLE = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """A rectangle of pixels, flattened row by row.
+    """A rectangle of pixels, flattened in row-major order.
 
-    Of a large target, bins take the place of pixels: means over squares of the frame's.
+    For a large target, the pixels are bins: means over squares of frame pixels.
     """
 
-    # the rectangle in the frame [px]
+    # the rectangle in the frame, in pixels of the window
     x0: int
     y0: int
     width: int
     height: int
     levels: FloatArray  # (n,): grey values, 0…1 of the data type's range
-    smooth: FloatArray  # (n,): the same, median of three by three
-    levels_per_count: float  # one grey value's step
+    smooth: FloatArray  # (n,): the same after a median filter of 3 × 3 pixels
+    levels_per_count: float  # step of one grey value
     # (6, n): normalised image coordinates x, y of the pixel centres, free of distortion, and their
-    # derivatives xx, xy, yx, yy with respect to the raw pixel coordinates
+    # derivatives xx, xy, yx, yy by the raw pixel coordinates
     rays: FloatArray
     # binning factor: each window pixel is the mean of `binning` × `binning` frame pixels
     binning: int = 1
-    # (n,): share of clipped pixels in every bin; None without bins
+    # (n,): share of clipped frame pixels in every bin; None without binning
     clipped: FloatArray | None = None
 
     def nearest(self, point_px: FloatArray) -> int:
@@ -50,7 +50,7 @@ class Window:
         return min(max(y - self.y0, 0), self.height - 1) * self.width + column
 
     def pixels(self, chosen: IndexArray) -> FloatArray:
-        """Return raw pixel coordinates (2, m) of the chosen pixels, by their index."""
+        """Return the raw pixel coordinates (2, m) of pixels with the given indices (m,)."""
         rows, columns = np.divmod(chosen, self.width)
         pixels = np.empty((2, len(chosen)))
         np.add(columns, self.x0, out=pixels[0])
@@ -59,12 +59,12 @@ class Window:
 
 
 def contour_px(camera: Camera, pose: Pose, radius_m: float) -> FloatArray:
-    """Return points (72, 2) of the image of a circle about the target's centre [px]."""
+    """Return the image of a circle about the target's centre: points (72, 2) [px]."""
     return camera.project(pose.transform(radius_m * _UNIT_CIRCLE))
 
 
 def semi_major_axis_px(contour: FloatArray) -> float:
-    """Return the semi-major axis of a circle's image of which `contour_px` gave the points [px]."""
+    """Return the semi-major axis of a circle's image, from its points by `contour_px` [px]."""
     half = len(contour) // 2
     return float(0.5 * np.hypot(*(contour[:half] - contour[half:]).T).max())
 
@@ -72,15 +72,14 @@ def semi_major_axis_px(contour: FloatArray) -> float:
 def cut_window(
     grey: GreyArray, camera: Camera, contour: FloatArray, margin_px: float, binning: int = 1
 ) -> Window:
-    """Cut out the image of a circle, by `contour_px`, with a margin around it.
+    """Cut out the image of a circle, given by `contour_px`, with a margin around it.
 
-    Camera, contour and margin are those of the window's pixels: with `binning`, of
-    `Camera.binned`.
+    With `binning`, camera, contour and margin refer to the binned pixels (`Camera.binned`).
 
     Raises
     ------
     Rejection
-        `CUT` if less than a quarter of the circle's box is within the frame.
+        `CUT` if less than a quarter of the circle's bounding box with margin is within the frame.
     """
     low, high = contour.min(axis=0) - margin_px, contour.max(axis=0) + margin_px
     height, width = (size // binning for size in grey.shape)
@@ -121,7 +120,7 @@ def _clipped(part: GreyArray, binning: int, levels: FloatArray, count: float) ->
 
 
 def _binned(values: np.ndarray[tuple[int, int], Any], count: int) -> FloatArray:
-    """Return the means over squares of `count` by `count`."""
+    """Return the means over squares of `count` × `count` pixels."""
     height, width = (size // count for size in values.shape)
     columns = values.reshape(height, count, width * count).sum(axis=1, dtype=np.float64)
     return np.asarray(columns.reshape(height, width, count).sum(axis=2) / (count * count))

@@ -18,10 +18,10 @@ from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.random_levels import needs_varying_levels
 from kgcp.measurement.adjustment.unknowns import unknowns_of
 from kgcp.measurement.image_model.blur import Blur
-from kgcp.measurement.image_model.light_field import LightField, knots_over
+from kgcp.measurement.image_model.light_field import LightField, lay_knots
 from kgcp.measurement.image_model.photometry import PARAM_COUNT, Param, Tone, encoded
-from kgcp.measurement.image_model.seen_shadows import SeenShadows
 from kgcp.measurement.image_model.shadow_edges import NO_EDGES, ShadowEdges
+from kgcp.measurement.image_model.shadow_search import FoundShadows
 from kgcp.measurement.records import ToneBase
 
 
@@ -48,9 +48,9 @@ def problem_of_unknown_tone() -> FitProblem:
 @pytest.mark.parametrize(
     ("has_levels", "inflation", "tones"),
     [
-        (False, 10.0, [Tone.UNKNOWN_FROM_LINE]),
-        (True, 2.9, [Tone.UNKNOWN_FROM_LINE]),
-        (True, 3.9, [Tone.UNKNOWN_FROM_LINE, Tone.UNKNOWN]),  # of fits beside the minimum, 3.9…5.7
+        (False, 10.0, [Tone.UNKNOWN_OVER_LINE]),
+        (True, 2.9, [Tone.UNKNOWN_OVER_LINE]),
+        (True, 3.9, [Tone.UNKNOWN_OVER_LINE, Tone.UNKNOWN]),  # of fits beside the minimum, 3.9…5.7
     ],
 )
 def test_the_other_base_is_tried_where_levels_leave_residuals_that_agree(
@@ -158,7 +158,7 @@ def test_a_fit_with_an_implausible_curve_gives_way_to_the_other_base(
         return stand_in(inflation=inflation if is_plausible else 2.5)
 
     monkeypatch.setattr(extensions, "pose_covariance", covariance)
-    srgb, line = fit(of_srgb, Tone.UNKNOWN), fit(of_line, Tone.UNKNOWN_FROM_LINE)
+    srgb, line = fit(of_srgb, Tone.UNKNOWN), fit(of_line, Tone.UNKNOWN_OVER_LINE)
     fits = extensions._by_likelihood({ToneBase.SRGB: srgb, ToneBase.LINE: line})
     assert fits.likelier is (srgb if is_srgb_likelier else line)
     assert (fits.rival is not None) == has_rival
@@ -224,9 +224,7 @@ def test_small_rings_keep_even_light_if_levels_that_vary_gain_little(
     assert chosen is (plain if is_even else varying)
 
 
-@pytest.mark.parametrize(
-    ("tone", "starts_from_seen"), [(Tone.UNKNOWN, True), (Tone.OF_BINS, False)]
-)
+@pytest.mark.parametrize(("tone", "starts_from_seen"), [(Tone.UNKNOWN, True), (Tone.BINNED, False)])
 def test_bins_in_nearly_even_light_keep_the_levels_that_they_were_fitted_with(
     monkeypatch: pytest.MonkeyPatch, *, tone: Tone, starts_from_seen: bool
 ) -> None:
@@ -307,7 +305,7 @@ def test_levels_over_a_second_base_start_from_those_over_the_first(
         (Tone.UNKNOWN, 2, {Param.EDGE_TONE: 101.0, Param.KURTOSIS: 39.0}, [Param.EDGE_TONE]),
         (Tone.UNKNOWN, 2, {Param.EDGE_TONE: 99.0, Param.KURTOSIS: 41.0}, []),
         (
-            Tone.UNKNOWN_FROM_LINE,
+            Tone.UNKNOWN_OVER_LINE,
             2,
             {Param.EDGE_TONE: 101.0, Param.KURTOSIS: 41.0},
             [Param.EDGE_TONE, Param.KURTOSIS],
@@ -357,14 +355,14 @@ STEP, STRIP = [0.9, 4.0, 0.8], [[2.5, 8.0, 0.3], [2.5, 16.0, 0.3]]
 def started_under(
     monkeypatch: pytest.MonkeyPatch, tone: Tone, lit: tuple[float, float], rows: list[list[float]]
 ) -> Parameters:
-    knots = knots_over((0.0, 63.0), (0.0, 47.0), np.array([32.0, 24.0]), (8.0,))
+    knots = lay_knots((0.0, 63.0), (0.0, 47.0), np.array([32.0, 24.0]), (8.0,))
     nothing = np.zeros((2, sum(knots.counts)))
     even = LightField(knots, nothing, nothing, np.zeros(2), NO_EDGES, np.zeros(2))
     monkeypatch.setattr(extensions, "even_field", lambda _: even)
     first = stand_in(pose=Pose(np.eye(3), np.array([0.0, 0.0, 9.0])), blur=Blur(0.5, 0.5, 0.0))
     problem = stand_in(tone=tone, censoring=stand_in(high=0.998))
-    alone_count = len(rows) % 2
-    seen = SeenShadows(np.array(lit), ShadowEdges(np.array(rows), alone_count))
+    single_count = len(rows) % 2
+    seen = FoundShadows(np.array(lit), ShadowEdges(np.array(rows), single_count))
     return extensions._under_shadows(problem, first, seen)
 
 
@@ -382,7 +380,7 @@ def test_fits_start_from_the_light_of_shadows_that_are_seen(
     assert start.field is not None
     added = (light[1] - light[0]) / (0.7 - 0.06)
     assert start.field.shadows.rows[:, 3:] == pytest.approx(np.array([added, added, -added]))
-    assert start.field.shadows.alone_count == 1
+    assert start.field.shadows.single_count == 1
 
 
 @pytest.mark.parametrize(
@@ -390,7 +388,7 @@ def test_fits_start_from_the_light_of_shadows_that_are_seen(
     [
         (Tone.LINEAR, 0.75, 1.5),  # half of ink is left, so half of the plate
         (Tone.LINEAR, 1.0, 2.0),
-        (Tone.UNKNOWN_FROM_LINE, 0.75, 1.0),  # the white that is seen is the scale
+        (Tone.UNKNOWN_OVER_LINE, 0.75, 1.0),  # the white that is seen is the scale
     ],
 )
 def test_ink_tells_how_bright_burnt_white_is(

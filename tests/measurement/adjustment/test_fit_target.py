@@ -198,7 +198,7 @@ def test_a_base_that_explains_a_frame_badly_is_compared_with_the_other(
     assert abs(compared.distance_m - by_both.distance_m) < 0.3 * by_both.sd_distance_m
 
     def fit_over_srgb(problem: FitProblem, *others: object) -> TwoPoses:
-        if problem.tone is Tone.UNKNOWN_FROM_LINE:
+        if problem.tone is Tone.UNKNOWN_OVER_LINE:
             raise Rejection(Reason.POOR_FIT)
         return fit(problem, *others)  # type: ignore[arg-type]  # whatever they are
 
@@ -220,12 +220,12 @@ def test_a_base_whose_fit_is_refused_gives_way_to_the_other(
 
     def check(fit: TargetFit) -> None:
         tones.append(fit.sample.problem.tone)
-        if fit.sample.problem.tone is Tone.UNKNOWN_FROM_LINE:
+        if fit.sample.problem.tone is Tone.UNKNOWN_OVER_LINE:
             raise Rejection(Reason.POOR_FIT)
 
     monkeypatch.setattr("kgcp.measurement.adjustment.fit_target.check_fit", check)
     rescued = measure_by_model(grey, camera, TARGET, start, known)
-    assert tones[0] is Tone.UNKNOWN_FROM_LINE
+    assert tones[0] is Tone.UNKNOWN_OVER_LINE
     assert rescued.distance_m == by_both.distance_m
     assert rescued.rival is None
 

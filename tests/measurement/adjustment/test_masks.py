@@ -63,15 +63,15 @@ def test_hidden_is_what_is_off_its_level_or_beyond_a_missing_edge(seed: int) -> 
     rng = np.random.default_rng(seed)
     smooth, rho_m = rng.uniform(0.0, 1.0, PIXELS), rng.uniform(0.0, 0.6, PIXELS)
     share = rng.integers(0, 2, PIXELS).astype(np.float64)
-    off_edge_m = rng.uniform(0.0, 0.1, PIXELS)
+    edge_distance_m = rng.uniform(0.0, 0.1, PIXELS)
     contrast = WHITE - BLACK
     hidden = np.zeros(PIXELS, dtype=bool)
     counts = _mark_hidden(
-        smooth, share, off_edge_m, rho_m, BLACK, contrast, RADIUS_M, SLACK_M, SD_M, hidden
+        smooth, share, edge_distance_m, rho_m, BLACK, contrast, RADIUS_M, SLACK_M, SD_M, hidden
     )
     expected, tested = np.zeros(PIXELS, dtype=bool), 0
     for i in range(PIXELS):
-        off_m, beyond_m = off_edge_m[i] - SLACK_M, rho_m[i] - RADIUS_M - SLACK_M
+        off_m, beyond_m = edge_distance_m[i] - SLACK_M, rho_m[i] - RADIUS_M - SLACK_M
         off_level = abs(smooth[i] - (BLACK + contrast * share[i])) / contrast
         limits = [math.inf]
         if off_m > 2.6 * SD_M and beyond_m < 0.0:
@@ -89,13 +89,13 @@ def test_hidden_is_what_is_off_its_level_or_beyond_a_missing_edge(seed: int) -> 
 def test_levels_are_medians_of_the_third_that_is_clearest_of_edges(seed: int) -> None:
     rng = np.random.default_rng(seed)
     levels, rho_m = rng.uniform(0.0, 1.0, PIXELS), rng.uniform(0.0, 0.6, PIXELS)
-    share, off_edge_m = rng.uniform(0.0, 1.0, PIXELS), rng.uniform(0.0, 0.1, PIXELS)
+    share, edge_distance_m = rng.uniform(0.0, 1.0, PIXELS), rng.uniform(0.0, 0.1, PIXELS)
     expected = []
     for is_kind in (share < 0.5, share >= 0.5):
         chosen = is_kind & (rho_m < RADIUS_M)
-        clearest = np.argsort(off_edge_m[chosen])[int(0.7 * chosen.sum()) :]
+        clearest = np.argsort(edge_distance_m[chosen])[int(0.7 * chosen.sum()) :]
         expected.append(float(np.median(levels[chosen][clearest])))
-    assert _median_levels(levels, rho_m, share, off_edge_m, RADIUS_M) == pytest.approx(
+    assert _median_levels(levels, rho_m, share, edge_distance_m, RADIUS_M) == pytest.approx(
         tuple(expected)
     )
 

@@ -18,9 +18,9 @@ from kgcp.measurement.adjustment.pixels import NEAR_SIGMAS, Sample, select_pixel
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.solver import predict
 from kgcp.measurement.image_model.blur import Blur, find_edge_incidence
-from kgcp.measurement.image_model.blurred_plate import white_share_only
+from kgcp.measurement.image_model.blurred_plate import white_share_without_derivatives
 from kgcp.measurement.image_model.photometry import PhotometricModel, Tone, light_of_levels
-from kgcp.measurement.image_model.plate import EVEN, plate_points
+from kgcp.measurement.image_model.plate import ISOTROPIC, plate_points
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.plate import PlateImage, PrintedPlate, image_plate
 from kgcp.simulation.regions import ConvexPolygon, regular_polygon
@@ -179,8 +179,8 @@ def test_sharpening_depends_on_the_far_tails_of_edges(
 
     window = problem.window
     points_m, px_m = plate_points(pose, window.rays), 0.45 / 12.0
-    incidence = find_edge_incidence(points_m, 1.07 * px_m, problem.circles, BLUR, EVEN)
-    share = white_share_only(pose.matrix, window.rays, BLUR.vector, incidence).value
+    incidence = find_edge_incidence(points_m, 1.07 * px_m, problem.circles, BLUR, ISOTROPIC)
+    share = white_share_without_derivatives(pose.matrix, window.rays, BLUR.vector, incidence).value
     plain = PhotometricModel(np.zeros((2, len(share))), problem.tone, None).levels(share, light)
     kernel = np.exp(-0.5 * (np.arange(-3, 4) / 1.2) ** 2)
     kernel /= kernel.sum()

@@ -40,16 +40,16 @@ def joint(tone: Tone, loss: float) -> JointFit:
     ("of_srgb", "of_line", "worthy"),
     [
         (998.0, 999.0, {Tone.SRGB}),  # bends that explain next to nothing
-        (900.0, 700.0, {Tone.UNKNOWN_FROM_LINE}),
-        (750.0, 700.0, {Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE}),
-        (700.0, 750.0, {Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE}),
+        (900.0, 700.0, {Tone.UNKNOWN_OVER_LINE}),
+        (750.0, 700.0, {Tone.UNKNOWN, Tone.UNKNOWN_OVER_LINE}),
+        (700.0, 750.0, {Tone.UNKNOWN, Tone.UNKNOWN_OVER_LINE}),
     ],
 )
 def test_bent_curves_that_are_nearly_as_likely_are_compared_by_their_own_masks(
     of_srgb: float, of_line: float, worthy: set[Tone]
 ) -> None:
     plain = [joint(Tone.SRGB, 1000.0), joint(Tone.LINEAR, 1200.0)]
-    bent = [joint(Tone.UNKNOWN, of_srgb), joint(Tone.UNKNOWN_FROM_LINE, of_line)]
+    bent = [joint(Tone.UNKNOWN, of_srgb), joint(Tone.UNKNOWN_OVER_LINE, of_line)]
     assert {each.tone for each in _worth_comparing(plain, bent)} == worthy
     assert {each.tone for each in _worth_comparing(plain, [])} == {Tone.SRGB}
 
@@ -57,8 +57,8 @@ def test_bent_curves_that_are_nearly_as_likely_are_compared_by_their_own_masks(
 @pytest.mark.parametrize(
     ("of_line", "worthy"),
     [
-        (740.0, {Tone.UNKNOWN_FROM_LINE}),  # a fifth of what the straight line is likelier by
-        (755.0, {Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE}),
+        (740.0, {Tone.UNKNOWN_OVER_LINE}),  # a fifth of what the straight line is likelier by
+        (755.0, {Tone.UNKNOWN, Tone.UNKNOWN_OVER_LINE}),
         (765.0, {Tone.UNKNOWN}),
     ],
 )
@@ -66,7 +66,7 @@ def test_a_line_is_bent_itself_unless_srgb_s_curve_is_much_likelier(
     of_line: float, worthy: set[Tone]
 ) -> None:
     plain = [joint(Tone.SRGB, 1200.0), joint(Tone.LINEAR, 1000.0)]
-    bent = [joint(Tone.UNKNOWN, 700.0), joint(Tone.UNKNOWN_FROM_LINE, of_line)]
+    bent = [joint(Tone.UNKNOWN, 700.0), joint(Tone.UNKNOWN_OVER_LINE, of_line)]
     assert {each.tone for each in _worth_comparing(plain, bent)} == worthy
 
 
@@ -200,7 +200,7 @@ def test_a_disc_that_begins_far_off_does_not_run_away_from_all_others() -> None:
     scene, rng = FieldScene(discs, 0.1, 0.62), np.random.default_rng(1)
     sensor = Sensor(tone=ToneCurve.FILM)
     photo = photograph(camera, pose, scene, Optics(0.6), sensor, rng, 1.5 / 0.62)
-    free = DiscUnknowns.of(Tone.UNKNOWN_FROM_LINE, sharpening_px=1.0)
+    free = DiscUnknowns.of(Tone.UNKNOWN_OVER_LINE, sharpening_px=1.0)
     fits = [adjust_disc(DiscTask(photo, each, []), free) for each in find_outlines(photo)]
     samples, states = [fit.sample for fit in fits], [fit.state for fit in fits]
     vector = states[1].vector.copy()

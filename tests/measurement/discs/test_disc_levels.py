@@ -38,7 +38,7 @@ def levels(tone: Tone, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     return LevelModel(offsets, tone, mask).linearised(share, values)
 
 
-@pytest.mark.parametrize("tone", [Tone.LINEAR, Tone.SRGB, Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE])
+@pytest.mark.parametrize("tone", [Tone.LINEAR, Tone.SRGB, Tone.UNKNOWN, Tone.UNKNOWN_OVER_LINE])
 def test_derivatives_contain_changes_of_sharpened_neighbours(tone: Tone) -> None:
     """Pixels that are not modelled are in the mask, and depend on light and tone as well."""
     _, jacobian = levels(tone, vector())
@@ -57,7 +57,7 @@ def test_table_is_srgb() -> None:
     assert np.abs(found - srgb_encoded(light)).max() < 1e-7
 
 
-@pytest.mark.parametrize("tone", [Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE])
+@pytest.mark.parametrize("tone", [Tone.UNKNOWN, Tone.UNKNOWN_OVER_LINE])
 def test_light_is_found_of_every_level(tone: Tone) -> None:
     curve = DiscTone(tone, (0.2, -0.6, 0.1))
     light = np.linspace(-0.1, 1.6, 50)
@@ -67,14 +67,14 @@ def test_light_is_found_of_every_level(tone: Tone) -> None:
 def test_curves_rise_everywhere() -> None:
     waves = steep_enough(np.array((1.5, -2.0, 0.3)))
     light = np.linspace(0.0, 1.0, 2000)
-    curve = DiscTone(Tone.UNKNOWN_FROM_LINE).bent(waves)
+    curve = DiscTone(Tone.UNKNOWN_OVER_LINE).bent(waves)
     slopes = np.diff(curve.levels(light)) / np.diff(light)
     assert 0.3 < slopes.min() < 0.36
     few = np.array((0.1, -0.2, 0.0))
     assert np.all(steep_enough(few) == few)
 
 
-@pytest.mark.parametrize("tone", [Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE])
+@pytest.mark.parametrize("tone", [Tone.UNKNOWN, Tone.UNKNOWN_OVER_LINE])
 def test_curves_do_not_make_darks_darker(tone: Tone) -> None:
     """Than a straight line, by more than an error of the black level; steep curves can."""
     waves = np.array((-1.04, 0.63, -0.25) if tone.is_srgb else (-0.6, 0.0, 0.0))

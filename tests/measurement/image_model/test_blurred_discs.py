@@ -151,7 +151,7 @@ def some_disc(radius: float, blur: tuple[float, float, float], streak: tuple[flo
 
 @settings(deadline=None)
 @given(radius=st.floats(0.3, 40.0), blur=BLURS, streak=STREAKS)
-def test_every_rule_is_its_plain_version(
+def test_every_rule_equals_a_plain_implementation(
     radius: float, blur: tuple[float, float, float], streak: tuple[float, float]
 ) -> None:
     disc = some_disc(radius, blur, streak)
@@ -167,7 +167,7 @@ def test_every_rule_is_its_plain_version(
 
 @settings(deadline=None, max_examples=40)
 @given(radius=st.floats(0.3, 40.0), blur=ROUND_BLURS, streak=STREAKS)
-def test_every_rule_is_the_integral_that_it_stands_for(
+def test_every_rule_approximates_its_integral(
     radius: float, blur: tuple[float, float, float], streak: tuple[float, float]
 ) -> None:
     disc = some_disc(radius, blur, streak)
@@ -187,7 +187,7 @@ def test_series_of_the_normal_distribution() -> None:
 
 @settings(deadline=None)
 @given(ratio=st.floats(0.1, 60.0), sigma=st.floats(0.3, 3.0))
-def test_every_disc_is_the_noncentral_chi_square(ratio: float, sigma: float) -> None:
+def test_isotropic_discs_follow_the_noncentral_chi_square(ratio: float, sigma: float) -> None:
     radius = ratio * sigma
     x, y = around(radius, 4.0 * sigma, 41)
     disc = Disc(radius, rule_for(ratio, ratio), xx=sigma**2, yy=sigma**2)
@@ -270,7 +270,7 @@ def test_an_edge_bends_under_oblique_blur_as_chords_say(
 
 
 @pytest.mark.parametrize(("radius", "length"), [(2.0, 4.0), (3.5, 9.0), (9.0, 12.0), (20.0, 30.0)])
-def test_a_streak_is_the_mean_of_shifted_discs(radius: float, length: float) -> None:
+def test_a_streak_equals_the_mean_of_shifted_discs(radius: float, length: float) -> None:
     """Against the noncentral χ² distribution, averaged over the exposure."""
     sigma, direction = 0.7, np.array([0.8, -0.6])
     whole = np.hypot(sigma, length / np.sqrt(12.0))
@@ -300,7 +300,7 @@ def test_anisotropic_blur_against_random_shifts() -> None:
 
 
 @pytest.mark.parametrize("length", [0.01, 0.13, 0.37, 0.4, 3.0, 9.0])
-def test_a_smeared_edge_is_the_mean_of_shifted_ones(length: float) -> None:
+def test_a_smeared_edge_equals_the_mean_of_shifted_edges(length: float) -> None:
     """Along the radius, where a streak does not bend the edge."""
     sharp = Disc(20.0, Quadrature.EDGE, 0.9, 1.4)
     shifts = (np.arange(2000) + 0.5) / 2000 - 0.5
@@ -310,7 +310,7 @@ def test_a_smeared_edge_is_the_mean_of_shifted_ones(length: float) -> None:
     np.testing.assert_allclose(smeared, mean, rtol=0.0, atol=2e-5)
 
 
-def test_every_pixel_is_served_once() -> None:
+def test_results_do_not_depend_on_the_number_of_pixels() -> None:
     """However many there are of them: batches have a last one that is not full."""
     disc = Disc(3.0, Quadrature.CHORDS_9)
     x, y = around(disc.radius, 3.0, 77)

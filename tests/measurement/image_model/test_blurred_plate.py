@@ -17,11 +17,11 @@ from kgcp.measurement.image_model.blur import Blur, EdgeIncidence, find_edge_inc
 from kgcp.measurement.image_model.blurred_plate import (
     kurtosis_row,
     white_share,
-    white_share_only,
+    white_share_without_derivatives,
 )
 from kgcp.measurement.image_model.edge_terms import smoothing_row
 from kgcp.measurement.image_model.plate import (
-    EVEN,
+    ISOTROPIC,
     Circles,
     blur_on_plate,
     circles_of,
@@ -29,7 +29,7 @@ from kgcp.measurement.image_model.plate import (
     plate_points,
 )
 from kgcp.measurement.image_model.quadrature import Quadrature
-from kgcp.measurement.image_model.ray_plate import views_of
+from kgcp.measurement.image_model.ray_plate import plate_views
 from kgcp.targets.layout import Ring
 
 CAMERA = Camera(1100, 800, 2300.0, 2310.0, 560.3, 391.8, k1=-0.06, k2=0.05, p1=-4e-4, p2=6e-4)
@@ -60,7 +60,7 @@ def rays_of(pixels: FloatArray) -> FloatArray:
 
 def pairs_of(pose: Pose, rays: FloatArray, blur: Blur) -> EdgeIncidence:
     scale = largest_metres_per_px(pose, rays)
-    return find_edge_incidence(plate_points(pose, rays), scale, CIRCLES, blur, EVEN)
+    return find_edge_incidence(plate_points(pose, rays), scale, CIRCLES, blur, ISOTROPIC)
 
 
 CIRCLES = circles_of(RINGS)
@@ -80,12 +80,14 @@ def moved(step: FloatArray) -> tuple[Pose, Blur]:
 
 
 @pytest.mark.parametrize("index", range(11))
-def test_jacobian_is_that_of_the_value(index: int) -> None:
+def test_white_share_jacobian_equals_finite_differences(index: int) -> None:
     blur = moved(np.zeros(11))[1]
     incidence = pairs_of(POSE, RAYS, blur)
     share = white_share(POSE.matrix, RAYS, blur.vector, incidence)
     assert np.allclose(
-        white_share_only(POSE.matrix, RAYS, blur.vector, incidence).value, share.value, atol=1e-12
+        white_share_without_derivatives(POSE.matrix, RAYS, blur.vector, incidence).value,
+        share.value,
+        atol=1e-12,
     )
     assert np.allclose(share.points_m, plate_points(POSE, RAYS), rtol=0.0, atol=1e-12)
     step = np.zeros(11)
@@ -93,7 +95,9 @@ def test_jacobian_is_that_of_the_value(index: int) -> None:
     levels = []
     for sign in (1.0, -1.0):
         pose, other = moved(sign * step)
-        levels.append(white_share_only(pose.matrix, RAYS, other.vector, incidence).value)
+        levels.append(
+            white_share_without_derivatives(pose.matrix, RAYS, other.vector, incidence).value
+        )
     numeric = (levels[0] - levels[1]) / 2e-5
     # rotations and streaks leave out how they change the blur on the plate: second order; and all
     # leave out derivatives of what oblique blur adds
@@ -127,7 +131,9 @@ def test_levels_are_those_of_a_finely_sampled_blurred_plate(distance_m: float) -
     expected = blurred.reshape(size, fine, size, fine).mean(axis=(1, 3)).ravel()
     blur = Blur(0.75**2 + 1.0 / 12.0, 0.75**2 + 1.0 / 12.0, 0.0)
     rays = rays_of(pixels)
-    seen = white_share_only(pose.matrix, rays, blur.vector, pairs_of(pose, rays, blur))
+    seen = white_share_without_derivatives(
+        pose.matrix, rays, blur.vector, pairs_of(pose, rays, blur)
+    )
     difference = (seen.value - expected)[np.hypot(*seen.points_m) < 0.6]
     assert np.abs(difference).max() < 0.02  # 16 × 16 samples know an edge to 1/32 px
     assert abs(difference.mean()) < 5e-4
@@ -157,7 +163,7 @@ def test_kurtosis_is_most_of_what_a_disc_of_light_differs_from_a_gaussian(
     variance = sd_px**2 + 1.0 / 12.0 + radius_px**2 / 4.0
     blur, rays = Blur(variance, variance, 0.0), rays_of(pixels_around(centre, half))
     incidence = pairs_of(pose, rays, blur)
-    seen = white_share_only(pose.matrix, rays, blur.vector, incidence)
+    seen = white_share_without_derivatives(pose.matrix, rays, blur.vector, incidence)
     row = kurtosis_row(seen.value, pose.matrix, rays, blur.vector, incidence)
     kurtosis = -(radius_px**4 / 16.0 + 1.0 / 120.0) / variance**2  # of the disc, and of a pixel
     on_plate = np.hypot(*seen.points_m) < 0.5
@@ -181,7 +187,7 @@ def test_rules_hold_on_a_steep_plate(streak: tuple[float, float]) -> None:
     closest = incidence.circles.copy()
     closest[closest[:, 4] < Quadrature.EDGE, 4] = Quadrature.CHORDS_70
     chosen, exact = (
-        white_share_only(pose.matrix, rays, blur.vector, each).value
+        white_share_without_derivatives(pose.matrix, rays, blur.vector, each).value
         for each in (incidence, replace(incidence, circles=closest))
     )
     assert np.abs(chosen - exact).max() < 4e-4
@@ -193,10 +199,12 @@ def test_smoothing_along_contours_is_half_the_second_derivative_along_them() -> 
     circles = circles_of((RING,)).part(slice(0, 2))
     rays = rays_of(PIXELS)
     scale = largest_metres_per_px(POSE, rays)
-    incidence = find_edge_incidence(plate_points(POSE, rays), scale, circles, sharp, EVEN)
+    incidence = find_edge_incidence(plate_points(POSE, rays), scale, circles, sharp, ISOTROPIC)
 
     def share_at(pixels: FloatArray) -> FloatArray:
-        return white_share_only(POSE.matrix, rays_of(pixels), sharp.vector, incidence).value
+        return white_share_without_derivatives(
+            POSE.matrix, rays_of(pixels), sharp.vector, incidence
+        ).value
 
     step = 0.05
     along_x, along_y = np.array([step, 0.0]), np.array([0.0, step])
@@ -210,7 +218,7 @@ def test_smoothing_along_contours_is_half_the_second_derivative_along_them() -> 
     ahead[edge] += step * tangents
     behind[edge] -= step * tangents
     second = (share_at(ahead) + share_at(behind) - 2.0 * middle)[edge] / step**2
-    row = smoothing_row(views_of(POSE.matrix, rays), sharp.total_covariance, incidence)[edge]
+    row = smoothing_row(plate_views(POSE.matrix, rays), sharp.total_covariance, incidence)[edge]
     assert edge.sum() > 100
     assert np.abs(second).max() > 0.02
     assert np.sqrt(np.mean((row - 0.5 * second) ** 2)) < 0.06 * np.sqrt(np.mean(row**2))

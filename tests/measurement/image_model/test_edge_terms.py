@@ -10,7 +10,7 @@ from scipy.special import ndtr
 from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.image_model.blur import EdgeIncidence
 from kgcp.measurement.image_model.edge_terms import skew_rows, spread_share_gradient
-from kgcp.measurement.image_model.ray_plate import views_of
+from kgcp.measurement.image_model.ray_plate import plate_views
 
 Light = Callable[[FloatArray, FloatArray], FloatArray]
 _RADIUS_PX = 8.0
@@ -25,7 +25,7 @@ def _around_the_edge(out_px: FloatArray, count: int) -> tuple[FloatArray, FloatA
 def _views(x: FloatArray, y: FloatArray) -> FloatArray:
     rays = np.zeros((6, len(x)))
     rays[0], rays[1], rays[2], rays[5] = x, y, 1.0, 1.0
-    return views_of(_POSE, rays)
+    return plate_views(_POSE, rays)
 
 
 def _incidence(count: int) -> EdgeIncidence:
@@ -85,7 +85,7 @@ def test_third_derivatives_follow_the_curvature_of_edges_in_oblique_views() -> N
     x, y = (contour[:, None] + out_px[:, None] * normals[:, None]).reshape(2, -1)
     rays = np.zeros((6, len(x)))
     rays[0], rays[1], rays[2], rays[5] = x, y / foreshortening, 1.0, 1.0 / foreshortening
-    rows = skew_rows(views_of(_POSE, rays), (sd_px**2, sd_px**2, 0.0), _incidence(len(x)))
+    rows = skew_rows(plate_views(_POSE, rays), (sd_px**2, sd_px**2, 0.0), _incidence(len(x)))
 
     line = np.arange(-_RADIUS_PX, _RADIUS_PX, step) + 0.5 * step
     u, v = np.meshgrid(line, foreshortening * line)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.measurement.image_model.light_field import LightField, knots_over
+from kgcp.measurement.image_model.light_field import LightField, lay_knots
 from kgcp.measurement.image_model.photometry import Light, light_after_step
 from kgcp.measurement.image_model.shadow_edges import NO_EDGES, ShadowEdges
 
@@ -23,7 +23,7 @@ def _field(
     columns: int = 64, rows: int = 48, spacings_px: tuple[float, ...] = (_SPACING_PX,)
 ) -> LightField:
     last_px = 99.0 + columns, 199.0 + rows
-    knots = knots_over((100.0, last_px[0]), (200.0, last_px[1]), CENTRE_PX, spacings_px)
+    knots = lay_knots((100.0, last_px[0]), (200.0, last_px[1]), CENTRE_PX, spacings_px)
     count = sum(knots.counts)
     return LightField(
         knots,
@@ -78,7 +78,7 @@ def test_cells_cover_the_window_with_the_centre_in_the_middle_of_one(
 ) -> None:
     (x, y), (width, height) = first_px, size_px
     centre_px = np.array([x + 0.37 * width, y + 0.58 * height])
-    knots = knots_over((x, x + width - 1), (y, y + height - 1), centre_px, (spacing_px,))
+    knots = lay_knots((x, x + width - 1), (y, y + height - 1), centre_px, (spacing_px,))
     for begin, cells, first, size, centre in zip(
         (knots.x0_px[0], knots.y0_px[0]),
         (knots.columns[0] - 2, knots.rows[0] - 2),
@@ -121,7 +121,7 @@ def test_gradient_of_the_contrast_is_that_of_what_is_added() -> None:
     rng = np.random.default_rng(5)
     field = _field()
     spacings_px = 2.5 * _SPACING_PX, _SPACING_PX
-    coarse = knots_over((100.0, 163.0), (200.0, 247.0), CENTRE_PX, spacings_px)
+    coarse = lay_knots((100.0, 163.0), (200.0, 247.0), CENTRE_PX, spacings_px)
     field = replace(
         field,
         knots=coarse,

@@ -60,7 +60,7 @@ def test_score_and_weight_are_derivatives_of_the_loss() -> None:
     check_derivatives(0.5 - 0.02 * z, no_clipping(len(z)), curved=inlying)
 
 
-def test_light_clipped_before_its_noise_has_derivatives_that_still_lead_back() -> None:
+def test_models_beyond_a_ceiling_keep_a_small_gradient() -> None:
     """Of a model on either side of the ceiling, and of the floor."""
     model = 0.5 + 0.02 * np.array([-9.0, -4.1, -2.1, -1.9, -0.5, 0.5, 1.9, 2.1, 4.1, 20.0, 40.0])
     clip = replace(no_clipping(len(model)), ceiling=0.54, floor=0.46)
@@ -72,7 +72,7 @@ def test_light_clipped_before_its_noise_has_derivatives_that_still_lead_back() -
     assert at < beyond < misfit(levels[:1], np.array([0.56]), sd[:1], no_clipping(1)).total
 
 
-def test_a_model_beyond_clipped_light_makes_no_outliers_of_what_it_explains() -> None:
+def test_pixels_explained_by_clipped_light_are_not_outliers() -> None:
     levels, model = np.array([0.99, 0.98, 0.5, 0.5]), np.array([1.0, 1.3, 0.51, 1.3])
     clip = replace(no_clipping(4), ceiling=1.0)
     found = misfit(levels, model, np.full(4, 0.02), clip)
@@ -135,7 +135,7 @@ def test_noise_follows_the_level() -> None:
 
 
 @pytest.mark.parametrize("from_edges", ["of both plateaus", "of ink and edges"])
-def test_noise_of_ink_is_that_of_no_share_of_plate(from_edges: str) -> None:
+def test_noise_of_ink_is_extrapolated_to_pure_ink(from_edges: str) -> None:
     """Its pixels have 2 % of plate in them, whose variance is six times as large."""
     rng, found = np.random.default_rng(13), []
     for _ in range(60):
@@ -183,7 +183,7 @@ def test_a_band_counts_by_its_pixels_against_ten_of_the_line(pixels: int) -> Non
 
 
 @pytest.mark.parametrize("is_ink_seen", [False, True])
-def test_edges_tell_the_noise_of_what_is_nowhere_seen(is_ink_seen: bool) -> None:  # noqa: FBT001 - a case
+def test_noise_of_an_unseen_plateau_is_taken_from_edges(is_ink_seen: bool) -> None:  # noqa: FBT001 - a case
     """Of a narrow ring no pixel is wholly ink: it has not the noise of the plate."""
     rng = np.random.default_rng(9)
     found: dict[bool, list[tuple[float, float, float]]] = {True: [], False: []}
@@ -257,9 +257,7 @@ def test_twelve_bits_in_a_file_of_sixteen_clip_where_values_pile_up() -> None:
 
 @pytest.mark.parametrize("flat", [0, 20_000])
 @pytest.mark.parametrize("burnt", [True, False])
-def test_what_compression_makes_of_clipped_levels_says_no_more_than_they(
-    *, burnt: bool, flat: int
-) -> None:
+def test_pixels_smeared_by_compression_count_as_clipped(*, burnt: bool, flat: int) -> None:
     """At either end of the range, on small plates and large ones, with edges of all grey values."""
     rng = np.random.default_rng(4)
     smeared = np.clip(np.rint(rng.normal(255.0, 2.0, 800)), 0.0, 255.0)
@@ -282,7 +280,7 @@ def test_levels_that_are_clipped_at_once_are_not_smeared() -> None:
 
 
 @pytest.mark.parametrize("burnt", [True, False])
-def test_what_lies_just_below_the_end_beside_edges_alone_is_not_smeared(*, burnt: bool) -> None:
+def test_levels_near_the_limit_beside_edges_alone_are_not_smeared(*, burnt: bool) -> None:
     """An edge ends there, or one colour is not yet clipped; compression smears elsewhere, too."""
     rng = np.random.default_rng(7)
     rows = np.full((WIDTH, WIDTH), 255.0)

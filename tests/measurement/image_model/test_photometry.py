@@ -23,14 +23,14 @@ from kgcp.measurement.image_model.photometry import (
     Param,
     PhotometricModel,
     Tone,
+    apply_tone,
+    apply_tone_uncompiled,
     decoded,
     encoded,
     light_after_step,
-    light_over,
+    light_over_base,
     plateau_levels,
-    share_before_edge_tone,
-    toned,
-    toned_between,
+    undo_edge_tone,
 )
 from kgcp.measurement.image_model.sharpening import unsharp_mask
 from kgcp.measurement.image_model.srgb import (
@@ -130,7 +130,7 @@ def test_photometric_rows_of_the_jacobian_are_derivatives(
     np.testing.assert_allclose(jacobian[Param[name.upper()]], expected, rtol=1e-6, atol=2e-7)
 
 
-@pytest.mark.parametrize("tone", [each for each in Tone if each is not Tone.OF_BINS])
+@pytest.mark.parametrize("tone", [each for each in Tone if each is not Tone.BINNED])
 def test_rows_of_the_jacobian_are_derivatives_in_uneven_light(tone: Tone) -> None:
     """Levels differ from pixel to pixel, also of those that are only sharpened with others."""
     light = replace(LIGHT if tone.is_shaped else UNSHAPED, linear_sharpening=0.0)
@@ -167,19 +167,19 @@ def test_rows_of_the_jacobian_are_derivatives_in_uneven_light(tone: Tone) -> Non
 
 
 @pytest.mark.parametrize("edge_tone", [-0.6, 0.0, 0.9])
-def test_edges_are_as_if_the_white_share_was_bent(edge_tone: float) -> None:
+def test_edge_tone_changes_the_white_share(edge_tone: float) -> None:
     photometry = make_imager(Tone.UNKNOWN, 0.0)
     light = replace(LIGHT, linear_sharpening=0.0)
     share = make_share(photometry).value
     bent = share + edge_tone * share * (1.0 - share)
     added = np.full((2, len(share)), 0.05)
-    toned = photometry.levels(share, replace(light, edge_tone=edge_tone), added)
-    np.testing.assert_allclose(toned, photometry.levels(bent, light, added), atol=1e-14)
-    back = share_before_edge_tone(bent, replace(light, edge_tone=edge_tone))
+    edge_toned = photometry.levels(share, replace(light, edge_tone=edge_tone), added)
+    np.testing.assert_allclose(edge_toned, photometry.levels(bent, light, added), atol=1e-14)
+    back = undo_edge_tone(bent, replace(light, edge_tone=edge_tone))
     np.testing.assert_allclose(back, share, atol=1e-12)
 
 
-@pytest.mark.parametrize("tone", [Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE])
+@pytest.mark.parametrize("tone", [Tone.UNKNOWN, Tone.UNKNOWN_OVER_LINE])
 def test_the_light_varies_before_the_tone_curve(tone: Tone) -> None:
     """Ink without light stays black; other pixels look as if they were whiter in even light."""
     photometry, light = make_imager(tone, 0.0), replace(LIGHT, black=0.0)
@@ -221,7 +221,7 @@ def test_sharpening_is_an_unsharp_mask_on_the_whole_window(modelled: float) -> N
     st.lists(st.floats(-0.15, 1.2), min_size=5, max_size=5),
     st.lists(st.floats(-0.2, 0.2), min_size=5, max_size=5),
 )
-def test_light_that_follows_a_step_has_the_levels_that_it_promises(
+def test_light_after_a_step_has_the_predicted_levels(
     light: list[float], change: list[float]
 ) -> None:
     x, step = np.array(light), 0.1 * np.array(change)
@@ -232,10 +232,10 @@ def test_light_that_follows_a_step_has_the_levels_that_it_promises(
         steps = zip(names, change, strict=True)
         return replace(before, **{n: getattr(before, n) + 0.5 * share * c for n, c in steps})
 
-    high, low = (toned(x + s * step, after(s).values) for s in (STEP, -STEP))
-    promised = toned(x, before.values) + (high - low) / (2.0 * STEP)
+    high, low = (apply_tone(x + s * step, after(s).values) for s in (STEP, -STEP))
+    promised = apply_tone(x, before.values) + (high - low) / (2.0 * STEP)
     moved = light_after_step(x, step, before.values, after(1.0).values)
-    np.testing.assert_allclose(toned(moved, after(1.0).values), promised, atol=1e-6)
+    np.testing.assert_allclose(apply_tone(moved, after(1.0).values), promised, atol=1e-6)
 
 
 def test_light_just_moves_where_the_tone_curve_is_flat() -> None:
@@ -263,16 +263,16 @@ def test_srgb_decodes_to_the_light_it_encodes(light: float) -> None:
     assert back == pytest.approx(light, abs=2e-7)  # the standard's two branches meet to 1e-7
 
 
-def test_few_numbers_have_the_tone_of_many() -> None:
+def test_uncompiled_tone_equals_the_compiled_one() -> None:
     share = np.linspace(0.0, 1.0, 33)
     np.testing.assert_allclose(
-        toned_between(share, LIGHT), toned(share, LIGHT.values), rtol=1e-14, atol=1e-15
+        apply_tone_uncompiled(share, LIGHT), apply_tone(share, LIGHT.values), rtol=1e-14, atol=1e-15
     )
     for value in (-0.1, 0.001, 0.7):
         assert srgb_encoded_number(value) == pytest.approx(float(srgb_encoded(np.array(value))))
 
 
-def test_many_pixels_are_encoded_like_few() -> None:
+def test_encode_pixels_equals_srgb_encoded() -> None:
     light = np.concatenate((np.linspace(-0.1, 2.0, 997), np.geomspace(1e-4, 30.0, 503)))
     slope = np.empty(len(light))
     np.testing.assert_allclose(encode_pixels(light, slope), srgb_encoded(light), rtol=1e-12)
@@ -304,8 +304,8 @@ FILM = Light(0.0, 1.0, tone_1=0.73, tone_2=0.34, tone_3=-0.78)  # as of sRGB's c
 @pytest.mark.parametrize(
     ("tone", "other", "light"),
     [
-        (Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE, replace(FILM, black=0.02, white=1.007)),
-        (Tone.UNKNOWN_FROM_LINE, Tone.UNKNOWN, Light(0.13, 0.95, tone_1=1.2, tone_2=-0.45)),
+        (Tone.UNKNOWN, Tone.UNKNOWN_OVER_LINE, replace(FILM, black=0.02, white=1.007)),
+        (Tone.UNKNOWN_OVER_LINE, Tone.UNKNOWN, Light(0.13, 0.95, tone_1=1.2, tone_2=-0.45)),
         (Tone.UNKNOWN, Tone.UNKNOWN, LIGHT),
     ],
 )
@@ -313,9 +313,10 @@ def test_over_another_base_a_curve_keeps_its_grey_values(
     tone: Tone, other: Tone, light: Light
 ) -> None:
     share = np.linspace(0.0, 1.0, 41)
-    same = light_over(light, tone, other)
+    same = light_over_base(light, tone, other)
     before, after = (
-        encoded(toned_between(share, each), base) for each, base in ((light, tone), (same, other))
+        encoded(apply_tone_uncompiled(share, each), base)
+        for each, base in ((light, tone), (same, other))
     )
     assert after[[0, -1]] == pytest.approx(before[[0, -1]], abs=1e-9)
     assert np.abs(after - before).max() < 0.04

@@ -33,23 +33,25 @@ def test_a_shadow_is_half_as_deep_at_its_edge_and_whole_beyond() -> None:
     assert added[0] == pytest.approx([-0.015, -0.03, 0.0], abs=1e-6)
 
 
-def test_a_shadow_within_another_takes_nothing() -> None:
+def test_a_shadow_within_another_has_no_effect() -> None:
     """An antenna's takes light beside the shade of a building, and none within that."""
     upright = [0.0, 5.0, 0.0, -0.03, -0.5]
     strip = [[1.57, -2.0, 0.0, -0.03, -0.5], [1.57, 2.0, 0.0, 0.03, 0.5]]
     places = np.array([[-20.0, -20.0, 20.0, 20.0], [9.0, 0.0, 9.0, 0.0]])
     added, _ = ShadowEdges(np.array([upright, *strip]), 1).added_with_gradient(places)
     assert added[1] == pytest.approx([0.0, -0.48, -0.5, -0.5], abs=0.01)
-    assert ShadowEdges(np.array([upright, *strip]), 1).sun_left(places) == pytest.approx(
+    assert ShadowEdges(np.array([upright, *strip]), 1).sunlit_share(places) == pytest.approx(
         [1, 1, 0, 0]
     )
     both, _ = ShadowEdges(np.array([upright, strip[0]]), 2).added_with_gradient(places)
     assert both[1] == pytest.approx([-0.5, -0.49, -0.5, -0.5], abs=0.01)
 
 
-@pytest.mark.parametrize("alone_count", [0, 1, 2])
-def test_derivatives_are_those_of_differences(offsets: FloatArray, alone_count: int) -> None:
-    edges = ShadowEdges(ROWS, alone_count)
+@pytest.mark.parametrize("single_count", [0, 1, 2])
+def test_shadow_edge_derivatives_equal_finite_differences(
+    offsets: FloatArray, single_count: int
+) -> None:
+    edges = ShadowEdges(ROWS, single_count)
     by_level, step = np.random.default_rng(2).normal(size=offsets.shape), 1e-6
     derivatives = edges.derivatives(offsets, by_level).reshape(4, 5, -1)
     for place in np.ndindex(ROWS.shape):
@@ -62,9 +64,9 @@ def test_derivatives_are_those_of_differences(offsets: FloatArray, alone_count: 
         assert np.abs(derivatives[place] - slope).max() < 1e-7
 
 
-@pytest.mark.parametrize("alone_count", [0, 1, 2])
-def test_the_gradient_is_that_of_the_contrast(offsets: FloatArray, alone_count: int) -> None:
-    edges, step = ShadowEdges(ROWS, alone_count), 1e-5
+@pytest.mark.parametrize("single_count", [0, 1, 2])
+def test_the_gradient_is_that_of_the_contrast(offsets: FloatArray, single_count: int) -> None:
+    edges, step = ShadowEdges(ROWS, single_count), 1e-5
     _, gradient = edges.added_with_gradient(offsets)
     for axis, towards in enumerate(np.eye(2)[:, :, None]):
         more, less = (
@@ -83,5 +85,5 @@ def test_without_edges_nothing_is_added(offsets: FloatArray) -> None:
     added, gradient = NO_EDGES.added_with_gradient(offsets)
     assert not added.any()
     assert not gradient.any()
-    assert NO_EDGES.sun_left(offsets).min() == 1.0
+    assert NO_EDGES.sunlit_share(offsets).min() == 1.0
     assert NO_EDGES.penalty == 0.0

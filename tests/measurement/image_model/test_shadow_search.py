@@ -10,13 +10,13 @@ from scipy.special import ndtr
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.measurement.image_model.photometry import Tone
-from kgcp.measurement.image_model.seen_shadows import (
+from kgcp.measurement.image_model.shadow_search import (
     _BORDERS,
-    _BY_STRIP,
     _DIRECTIONS,
-    _FEWEST_PIXELS,
-    FlatPixels,
-    SeenShadows,
+    _MIN_PIXELS,
+    _STRIP_FACTOR,
+    FoundShadows,
+    PlateauPixels,
     _best_step,
     find_shadows,
 )
@@ -32,7 +32,7 @@ def flat_under(
     ink: float = 0.08,
     plate: float = 0.75,
     left: float = 0.5,
-) -> FlatPixels:
+) -> PlateauPixels:
     """Return plate within half of the radius and ink around it.
 
     Shades beyond edges, and one along a strip, leave the same share of both.
@@ -47,7 +47,7 @@ def flat_under(
         sun = sun * (1.0 - (near - far))
     light = left + (1.0 - left) * sun
     levels = np.where(kind, plate, ink) * light + NOISE * rng.standard_normal(len(kind))
-    return FlatPixels(offsets, kind, np.clip(levels, 0.0, 1.0), HIGH)
+    return PlateauPixels(offsets, kind, np.clip(levels, 0.0, 1.0), HIGH)
 
 
 def beyond(line: list[float], offsets: FloatArray) -> FloatArray:
@@ -57,7 +57,7 @@ def beyond(line: list[float], offsets: FloatArray) -> FloatArray:
     return np.asarray(ndtr((along_px - offset_px) / math.exp(log_width)))
 
 
-def lines_of(seen: SeenShadows) -> FloatArray:
+def lines_of(seen: FoundShadows) -> FloatArray:
     lines = seen.edges.rows[:, :2].copy()
     lines[:, 0] %= 2.0 * math.pi
     return lines
@@ -67,9 +67,9 @@ def test_even_light_has_no_shadows() -> None:
     assert find_shadows(flat_under([], []), Tone.LINEAR) == []
 
 
-def test_one_edge_is_a_shade_of_its_own() -> None:
+def test_a_single_edge_is_found_with_its_shade() -> None:
     (seen,) = find_shadows(flat_under([EDGE], []), Tone.LINEAR)
-    assert seen.edges.alone_count == 1
+    assert seen.edges.single_count == 1
     assert lines_of(seen)[0] == pytest.approx(EDGE[:2], abs=0.2)
     assert seen.lit == pytest.approx([0.08, 0.75], abs=0.002)
     assert seen.edges.rows[0, 3:] == pytest.approx([-0.04, -0.375], abs=0.003)
@@ -78,7 +78,7 @@ def test_one_edge_is_a_shade_of_its_own() -> None:
 
 def test_a_strip_has_two_edges_and_hides_nothing() -> None:
     seen = find_shadows(flat_under([], STRIP), Tone.LINEAR)[0]
-    assert seen.edges.alone_count == 0
+    assert seen.edges.single_count == 0
     assert lines_of(seen) == pytest.approx(np.array(STRIP)[:, :2], abs=0.2)
     assert seen.edges.rows[:, 4] == pytest.approx([-0.375, 0.375], abs=0.02)
 
@@ -86,8 +86,8 @@ def test_a_strip_has_two_edges_and_hides_nothing() -> None:
 def test_a_strip_is_told_from_the_shade_that_it_runs_into() -> None:
     """The edge comes first, although the strip adds to what it explains."""
     first, both = find_shadows(flat_under([EDGE], STRIP), Tone.LINEAR)
-    assert (first.edges.alone_count, len(first.edges.rows)) == (1, 1)
-    assert (both.edges.alone_count, len(both.edges.rows)) == (1, 3)
+    assert (first.edges.single_count, len(first.edges.rows)) == (1, 1)
+    assert (both.edges.single_count, len(both.edges.rows)) == (1, 3)
     assert lines_of(both) == pytest.approx(np.array([EDGE, *STRIP])[:, :2], abs=0.2)
     assert both.edges.rows[:, 4] == pytest.approx([-0.375, -0.375, 0.375], abs=0.02)
 
@@ -107,17 +107,17 @@ def test_a_highlight_beside_which_white_is_burnt_too_is_no_shade() -> None:
     assert find_shadows(flat, Tone.LINEAR) == []
 
 
-def test_what_ink_alone_shows_is_no_light() -> None:
+def test_edges_seen_on_ink_alone_are_rejected() -> None:
     flat = flat_under([], [])
     levels = flat.levels + 0.2 * ((flat.kind == 0) & (flat.offsets[0] > 5.0))
-    assert find_shadows(FlatPixels(flat.offsets, flat.kind, levels, HIGH), Tone.LINEAR) == []
+    assert find_shadows(PlateauPixels(flat.offsets, flat.kind, levels, HIGH), Tone.LINEAR) == []
 
 
 @pytest.mark.parametrize(("ink", "plate"), [(0.0, 1.0), (0.4, 0.4), (0.8, 0.3), (0.0, 0.0)])
 def test_without_noise_or_contrast_there_are_no_shadows(ink: float, plate: float) -> None:
     flat = flat_under([], [])
     levels = np.where(flat.kind, plate, ink)
-    assert find_shadows(FlatPixels(flat.offsets, flat.kind, levels, HIGH), Tone.LINEAR) == []
+    assert find_shadows(PlateauPixels(flat.offsets, flat.kind, levels, HIGH), Tone.LINEAR) == []
 
 
 def test_ink_that_is_brighter_than_plate_is_in_no_shade() -> None:
@@ -140,7 +140,7 @@ def test_the_step_that_is_found_explains_most_of_all() -> None:
             within &= (before >= near)[:, None]
             by_kind = [_explained(values[kind == k], within[kind == k]) for k in (0, 1)]
             explained = by_kind[0] + by_kind[1]
-            explained[:-1] *= _BY_STRIP
+            explained[:-1] *= _STRIP_FACTOR
             if explained.max() > most:
                 most = float(explained.max())
                 found = way, near, near + 1 + int(explained.argmax())
@@ -157,7 +157,7 @@ def test_the_step_that_is_found_explains_most_of_all() -> None:
 def _explained(values: FloatArray, within: BoolArray) -> FloatArray:
     """Of squares, by steps (b,) that hold some of the values, given as columns (n, b)."""
     count = within.sum(axis=0)
-    enough = np.minimum(count, len(values) - count) >= _FEWEST_PIXELS
+    enough = np.minimum(count, len(values) - count) >= _MIN_PIXELS
     inside = values @ within / np.maximum(count, 1)
     outside = values @ ~within / np.maximum(len(values) - count, 1)
     left = np.sum((values[:, None] - np.where(within, inside, outside)) ** 2, axis=0)

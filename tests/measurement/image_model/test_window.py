@@ -61,7 +61,7 @@ def test_levels_are_shares_of_the_range(
 
 
 @pytest.mark.parametrize("centre_px", [(4.0, 170.0), (474.0, 181.0), (240.0, 2.0), (239.0, 357.0)])
-def test_the_frame_s_border_cuts(
+def test_windows_are_cut_at_the_frame_s_border(
     camera: Camera, place_plate: PlacePlate, centre_px: tuple[float, float]
 ) -> None:
     window = cut_plate(numbered_frame(camera), camera, place_plate(centre_px, 30.0))
