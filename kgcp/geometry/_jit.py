@@ -148,7 +148,7 @@ def interpreted(function: _Function) -> _Function:
     return cast("_Function", cast("_Compilable", function).interpreted)
 
 
-def summed(function: _Function) -> _Function:
+def reassociated(function: _Function) -> _Function:
     """Compile as `compiled`, and let the compiler reorder sums to vectorise them."""
     return cast("_Function", _Compilable(function, fastmath={"contract", "reassoc"}))
 

@@ -15,7 +15,7 @@ from kgcp.geometry.arrays import FloatArray
 LENS = (-0.1, 0.05, 1e-4, -2e-4, 0.01, 0.02, 0.0, 0.0)
 SCALE = (3100.0, 3110.0, 2001.0, 1498.0)
 _KGCP = Path(_jit.__file__).parents[1]
-_DECORATORS = {"compiled", "compiled_if_often", "summed", "inlined", "fused"}
+_DECORATORS = {"compiled", "compiled_if_often", "reassociated", "inlined", "fused"}
 
 
 def fresh_copy(module: ModuleType) -> ModuleType:
@@ -98,11 +98,11 @@ def test_functions_with_reordered_sums_are_called_by_python_only(
     """Else there could be two versions, and a process would get the one that it compiled itself."""
     entries = set()
     for path, functions in by_file.items():
-        loose = {name for name, each in functions.items() if _has(each, "fused", "summed")}
+        loose = {name for name, each in functions.items() if _has(each, "fused", "reassociated")}
         entry = {
             name
             for name, each in functions.items()
-            if _has(each, "summed") or (_called(each) & loose and not _has(each, "fused"))
+            if _has(each, "reassociated") or (_called(each) & loose and not _has(each, "fused"))
         }
         callers = [name for name, each in functions.items() if _called(each) & entry]
         assert not callers, f"{path}: {callers} call {entry}"

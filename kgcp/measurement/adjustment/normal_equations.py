@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg.lapack import dposv
 
 from kgcp.errors import Reason, Rejection
-from kgcp.geometry._jit import compiled, summed
+from kgcp.geometry._jit import compiled, reassociated
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.image_model.noise import Misfit
@@ -56,7 +56,7 @@ def normal_matrix(scaled: FloatArray, current: Misfit, unknowns: Unknowns) -> Fl
     return weighted_products(scaled, current.weight, unknowns.free_precision)
 
 
-@summed
+@reassociated
 def weighted_products(scaled: FloatArray, weight: FloatArray, precision: FloatArray) -> FloatArray:
     """Return the products of all rows, weighted and summed over pixels, plus a diagonal precision.
 
