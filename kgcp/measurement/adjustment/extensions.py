@@ -459,8 +459,8 @@ def _under_shadows(problem: FitProblem, first: Parameters, seen: FoundShadows) -
     # the second edge of a strip of shadow adds back what the first one takes
     falls = rows[:, INK:].sum(axis=1, keepdims=True) < 0.0
     steps = np.where(falls, rows[:, INK:], -rows[:, INK:])
-    beyond = decoded(np.maximum(seen.lit + steps, 0.0), problem.tone)
-    ink, plate = decoded(np.maximum(seen.lit, 0.0), problem.tone).tolist()
+    beyond = decoded(np.maximum(seen.sunlit_levels + steps, 0.0), problem.tone)
+    ink, plate = decoded(np.maximum(seen.sunlit_levels, 0.0), problem.tone).tolist()
     # if the curve is unknown, the white that is seen sets the scale
     if seen.is_burnt(problem.censoring.high) and not problem.tone.is_unknown:
         plate = _burnt_white(ink, plate, beyond)

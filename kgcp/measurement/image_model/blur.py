@@ -78,15 +78,15 @@ class Blur:
 
 
 def variance_in_bins(variance_px2: float, count: int) -> float:
-    """Return a variance [px²] in units of bins of `count` × `count` pixels, squared.
+    """Return a blur's variance after binning, in squared widths of bins of `count` pixels.
 
-    Both variances include the integration over a pixel or a bin.
+    Both variances include the integration, over a pixel and over a bin.
     """
     return (variance_px2 + (count * count - 1) / 12.0) / (count * count)
 
 
 def variance_in_pixels(variance: float, count: int) -> float:
-    """Return the variance [px²] from one in bins: the inverse of `variance_in_bins`.
+    """Return the variance in pixels [px²] of a blur before binning: inverts `variance_in_bins`.
 
     It is at least that of the integration over a pixel.
     """

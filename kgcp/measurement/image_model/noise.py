@@ -28,9 +28,9 @@ _MIN_NOISE_COUNTS = 0.3  # in grey values; quantisation alone makes 1/√12
 _KEPT_SHARE = 0.9  # of the squared residuals, in the trimmed variance
 _TRIMMED_VARIANCE = 0.6230  # of a unit normal variable, within its central 90 %
 _MIN_SAMPLES = 8
-# Largest share of the variance of ink pixels that is attributed to the plate in them. Jagged edges
-# scatter more than such pixels. Without a limit, that was subtracted from the noise of ink until
-# nothing was left, and the tone curve did not converge.
+# Largest share of the variance of ink pixels that is attributed to the plate in them. Residuals at
+# jagged edges scatter for another reason. Without a limit, this scatter was subtracted from the
+# noise of ink until nothing was left, and the tone curve did not converge.
 _MAX_PLATE_IN_INK = 0.1
 # A sensor that clips below full scale is recognised by equal values: more than the first share of
 # the pixels has the largest value, and fewer lie just below it, down to the second share of that
@@ -58,10 +58,10 @@ _MIN_SMEAR_EXCESS, _SMEAR_SIGMAS = 1.0, 2.5
 # edges alone; with this test, the scatter of their centres fell from 0.103 px to 0.085 px.
 _MIN_SMEARED_AWAY = 0.2
 
-# If light is clipped before the noise is added (`Censoring.ceiling`), a seen pixel is compared with
-# the clipped model. So much of what the model exceeds the ceiling by still counts: without it, a
-# model that is far too bright would never return. Radii of burnt discs in JPEGs were off by up to
-# 0.16 px without a ceiling, now by up to 0.09 px.
+# If light is clipped before the noise is added (`Censoring.ceiling`), pixels below the clipping
+# limit are compared with the clipped model. This share of the model's excess over the ceiling still
+# counts: without it, a model that is far too bright would never come back. Radii of burnt discs in
+# JPEGs were off by up to 0.16 px without a ceiling, now by up to 0.09 px.
 _BEYOND_CLIPPING = 0.1
 
 # Limits and middles of the bands of the white share. They are narrow at both ends, where

@@ -128,8 +128,8 @@ class Light:
     # strength of the unsharp mask after the tone curve, and of the one before it
     sharpening: float = 0.0
     linear_sharpening: float = 0.0
-    # Share · (1 − share) times this is what processing that follows the local contrast adds to the
-    # white share. Only if the levels vary; otherwise the tone curve has the same effect.
+    # Processing that follows the local contrast adds this times share · (1 − share) to the white
+    # share. Only if the levels vary; otherwise the tone curve has the same effect.
     edge_tone: float = 0.0
 
     @property

@@ -21,8 +21,9 @@ from kgcp.measurement.search.templates import ANGLES, CIRCLE, SAMPLED_RADII
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Ring
 
-# Tuning of the candidates. Its benchmarks are `benchmarks.search.hard_frames`, for what is found
-# (values in docs/method.md, "Constants of the search"), and `benchmarks.search.false_alarms`.
+# Tuning of the candidates. There are two benchmarks: `benchmarks.search.hard_frames` for the
+# targets found (results in docs/method.md, "Constants of the search"), and
+# `benchmarks.search.false_alarms`.
 _MIN_CONTRAST = 0.02  # relative to the frame's white
 _MIN_DOT_CONTRAST = 0.1  # relative to the ring's contrast; blur may leave so little of the dots
 # Largest spread of the grey values of ink, of disc and of plate, relative to the contrast in full

@@ -25,8 +25,8 @@ from kgcp.measurement.search.ring_filter import PEAK_RADIUS_PX, find_peaks
 # their radii below the second. With narrower limits more of them are left to be tracked, which
 # costs time (`benchmarks.speed.relative_costs`). With wider limits a replica is taken for the ring
 # around it.
-_NEAR_SEEDS, _ALIKE_SEEDS = 0.3, 0.25
-_NEAR_OUTLINES, _ALIKE_OUTLINES = 0.25, 0.15
+_MAX_SEED_DISTANCE, _MAX_SEED_LOG_RATIO = 0.3, 0.25
+_MAX_OUTLINE_DISTANCE, _MAX_OUTLINE_LOG_RATIO = 0.25, 0.15
 # A level is searched if the radius that its peaks stand for is at least this share of the smallest
 # radius that is looked for.
 _MIN_RADIUS_SHARE = 0.93
@@ -36,7 +36,11 @@ _DIRECTIONS = np.stack((np.cos(RAYS_RAD), np.sin(RAYS_RAD)), axis=-1)
 
 
 def non_max_suppression(
-    centres: FloatArray, radii: FloatArray, clearness: FloatArray, near: float, alike: float
+    centres: FloatArray,
+    radii: FloatArray,
+    clearness: FloatArray,
+    max_distance: float,
+    max_log_ratio: float,
 ) -> IndexArray:
     """Return the indices of circles that are not similar to a clearer one, the clearest first.
 
@@ -44,13 +48,13 @@ def non_max_suppression(
     ----------
     centres : (n, 2) array
     radii, clearness : (n,) arrays
-    near : float
+    max_distance : float
         Largest distance of the centres of similar circles, relative to the clearer one's radius.
-    alike : float
+    max_log_ratio : float
         Largest difference of the logarithms of their radii.
     """
     order, by_row = np.argsort(-clearness, kind="stable"), np.argsort(centres[:, 1], kind="stable")
-    return order[_is_first(centres, radii, order, by_row, near, alike)[order]]
+    return order[_is_first(centres, radii, order, by_row, max_distance, max_log_ratio)[order]]
 
 
 @compiled
@@ -59,8 +63,8 @@ def _is_first(
     radii: FloatArray,
     order: IndexArray,
     by_row: IndexArray,
-    near: float,
-    alike: float,
+    max_distance: float,
+    max_log_ratio: float,
 ) -> BoolArray:
     """Return which circles (n,) are not similar to a clearer one.
 
@@ -74,7 +78,7 @@ def _is_first(
     for clearer in order:
         if not first[clearer]:
             continue
-        reach = near * radii[clearer]
+        reach = max_distance * radii[clearer]
         for step in (-1, 1):
             place = position[clearer] + step
             while 0 <= place < len(by_row):
@@ -84,7 +88,7 @@ def _is_first(
                     break
                 x = centres[other, 0] - centres[clearer, 0]
                 if x * x + y * y <= reach * reach and rank[other] > rank[clearer]:
-                    first[other] &= abs(math.log(radii[other] / radii[clearer])) > alike
+                    first[other] &= abs(math.log(radii[other] / radii[clearer])) > max_log_ratio
                 place += step
     return first
 
@@ -117,7 +121,7 @@ def find_seeds(pyramid: Pyramid, min_radius_px: float) -> Seeds:
     peaks, ends = find_peaks(pyramid.reduced, pyramid.levels[first:])
     rings = check_peaks(pyramid, peaks, ends)
     centres, radii, contrasts = np.ascontiguousarray(rings[:, :2]), *rings[:, 2:].T.copy()
-    kept = non_max_suppression(centres, radii, contrasts, _NEAR_SEEDS, _ALIKE_SEEDS)
+    kept = non_max_suppression(centres, radii, contrasts, _MAX_SEED_DISTANCE, _MAX_SEED_LOG_RATIO)
     return Seeds(centres, radii, contrasts).chosen(kept)
 
 
@@ -154,6 +158,6 @@ def _fit_outlines(pyramid: Pyramid, seeds: Seeds) -> FloatArray:
     radii, centres = np.sqrt(ellipses[:, 2:4].prod(axis=1)), np.ascontiguousarray(ellipses[:, :2])
     return ellipses[
         non_max_suppression(
-            centres, radii, shares * seeds.contrasts, _NEAR_OUTLINES, _ALIKE_OUTLINES
+            centres, radii, shares * seeds.contrasts, _MAX_OUTLINE_DISTANCE, _MAX_OUTLINE_LOG_RATIO
         )
     ]

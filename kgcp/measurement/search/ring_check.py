@@ -35,8 +35,8 @@ _FINE = np.array((0.9, 1.0, 1.1))
 _FEW, _MANY, _ALL = 8, 16, 24  # directions of the first, second and final test
 _MIN_OF_FEW, _MIN_OF_MANY = 4, 9  # directions that must pass: a hidden quarter and dots leave half
 _MIN_CONTRAST = 5  # grey values; less is noise
-# Largest spread of the ring, relative to the contrast. Large rings may have more, since there are
-# so few peaks from this radius on that it costs nothing.
+# Largest spread of the ring, relative to the contrast: in general, and for rings from `_LARGE_PX`
+# on. There are so few peaks of this size that the wider limit costs nothing.
 _MAX_RING_SPREAD, _MAX_LARGE_RING_SPREAD = 0.5, 0.8
 _LARGE_PX = 22.0
 # A surround counts as bright if it is so many times as bright as the ring in the same direction. So

@@ -32,8 +32,9 @@ from kgcp.measurement.search.templates import (
 from kgcp.measurement.search.uneven_light import MIN_CORRECTED_RADIUS_PX, light_corrected_patch
 from kgcp.targets.layout import Ring
 
-# Tuning of the comparison. Its benchmarks are `benchmarks.search.hard_frames`, for what is found
-# (values in docs/method.md, "Constants of the search"), and `benchmarks.search.false_alarms`.
+# Tuning of the comparison. There are two benchmarks: `benchmarks.search.hard_frames` for the
+# targets found (results in docs/method.md, "Constants of the search"), and
+# `benchmarks.search.false_alarms`.
 MIN_SCORE_OF_A_CODE = 0.7
 """Score above which a ring with dots carries some code, though perhaps another one."""
 _CLEAR_SCORE = 0.9  # of a whole ring; above, no part of it is hidden
@@ -42,8 +43,8 @@ _MIN_SCORE_TO_CORRECT = 0.6  # for a correction of the light; most rings of some
 # · contrast of the dots), because noise may look like a dot if the dots are faint.
 _MAX_MISFIT, _MISFIT_FAINT, _MISFIT_BY_DOTS = 0.45, 0.2, 0.5
 _MIN_BLACK = -0.3  # relative to the contrast; sharpening makes small rings darker than black
-# Constants for rings that are partly hidden.
-# Quantile of the steps at an edge that is typical of its visible part, however much is hidden.
+# The other constants are for partly hidden rings. The first is the quantile of an edge's steps that
+# is typical of its visible part, however much is hidden.
 _TYPICAL = 0.65
 _MIN_STEP = 0.35  # of a visible edge, relative to the typical one
 _MIN_RUN = 13  # samples of a hidden part; a dot that is too large takes fewer
@@ -54,8 +55,8 @@ _MAX_HIDDEN = 0.4  # share of the angles
 _MIN_VISIBLE_DOTS = 0.5
 _OTHER_LAG = 6  # samples; matches that are farther off belong to another heading
 _MARGIN = 0.04  # by which the best score must exceed those of other headings
-# Score along the visible part of the code circle, at any heading. 160 hidden or cut targets had
-# 0.77 or more.
+# Least score along the visible part of the code circle, the best over all headings. 160 hidden or
+# cut targets had 0.77 or more.
 _MIN_CODE_CIRCLE_SCORE = 0.6
 
 _TYPICAL_RANK = round(_TYPICAL * (ANGLES - 1))

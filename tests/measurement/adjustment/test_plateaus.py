@@ -86,7 +86,7 @@ def test_a_shadow_s_edge_is_found_where_it_lies(
     turn = (angle - way + math.pi) % (2.0 * math.pi) - math.pi
     assert turn == pytest.approx(0.0, abs=math.radians(2.0))
     assert offset_px == pytest.approx(off_px, abs=1.0)
-    assert seen.lit == pytest.approx((0.08, 0.75), abs=0.01)
+    assert seen.sunlit_levels == pytest.approx((0.08, 0.75), abs=0.01)
     assert step == pytest.approx([-0.08 * (1.0 - LEFT), -0.75 * (1.0 - LEFT)], abs=0.01)
 
 
@@ -100,7 +100,7 @@ def test_a_step_that_only_plate_shows_leaves_ink_as_it_is(
         math.sin(WAY),
     )
     (seen,) = shadows_across(problem, replace(plateaus, flat=(ink[along < 52.0], plate)))
-    assert seen.lit[0] == pytest.approx(0.08, abs=0.01)
+    assert seen.sunlit_levels[0] == pytest.approx(0.08, abs=0.01)
     assert seen.edges.rows[0, 3:] == pytest.approx([0.0, -0.75 * (1.0 - LEFT)], abs=0.04)
 
 

@@ -71,7 +71,7 @@ def test_a_single_edge_is_found_with_its_shade() -> None:
     (seen,) = find_shadows(flat_under([EDGE], []), Tone.LINEAR)
     assert seen.edges.single_count == 1
     assert lines_of(seen)[0] == pytest.approx(EDGE[:2], abs=0.2)
-    assert seen.lit == pytest.approx([0.08, 0.75], abs=0.002)
+    assert seen.sunlit_levels == pytest.approx([0.08, 0.75], abs=0.002)
     assert seen.edges.rows[0, 3:] == pytest.approx([-0.04, -0.375], abs=0.003)
     assert not seen.is_burnt(HIGH)
 
