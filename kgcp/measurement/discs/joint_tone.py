@@ -184,7 +184,7 @@ def compressed_fit_at(
     fit = disc_fit_at(sample, state, free, sd)
     if pixels is None:
         return fit
-    alone, clips = pixels.alone, sample.censoring
+    alone, clips = pixels.outside_blocks, sample.censoring
     clips = replace(clips, at_high=clips.at_high[alone], at_low=clips.at_low[alone])
     of_blocks = pixels.misfit(fit.levels, sd)
     of_alone = misfit(sample.levels[alone], fit.levels[alone], sd[alone], clips)

@@ -156,13 +156,13 @@ def _pair_up(
     A pixel outside a circle is out of reach if it is so along the direction from the circle's
     centre, given the blur in that direction.
     """
-    count, found, most_m = points_m.shape[1], 0, reach_m + slack_m
+    count, member_count, max_reach_m = points_m.shape[1], 0, reach_m + slack_m
     starts, background = np.zeros(len(circles) + 1, np.intp), np.ones(count)
     members = np.empty(2 * count, np.intp)
     for c in range(len(circles)):
-        if found + count > len(members):
+        if member_count + count > len(members):
             members = np.concatenate((members, np.empty_like(members)))
-        within_m, beyond_m = max(circles[c, 2] - most_m, 0.0), circles[c, 2] + most_m
+        within_m, beyond_m = max(circles[c, 2] - max_reach_m, 0.0), circles[c, 2] + max_reach_m
         for i in range(count):
             dx, dy = points_m[0, i] - circles[c, 0], points_m[1, i] - circles[c, 1]
             square = dx * dx + dy * dy
@@ -174,7 +174,7 @@ def _pair_up(
                 outside_m = distance_m - circles[c, 2] - slack_m
                 if outside_m > 0.0 and outside_m * distance_m > reach_m * math.sqrt(spread_m2):
                     continue
-                members[found] = i
-                found += 1
-        starts[c + 1] = found
-    return starts, members[:found], background
+                members[member_count] = i
+                member_count += 1
+        starts[c + 1] = member_count
+    return starts, members[:member_count], background

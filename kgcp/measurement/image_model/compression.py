@@ -114,7 +114,8 @@ class CompressedPixels:
     # (k,): indices of the pixels in blocks that are complete and not clipped
     in_blocks: IndexArray
     places: IndexArray  # (k,): their indices in the flattened blocks
-    alone: IndexArray  # (n - k,): indices of the other pixels, which are compared one by one
+    # (n - k,): indices of the other pixels, which are compared one by one
+    outside_blocks: IndexArray
     observed: FloatArray  # (b, 8, 8): grey values of the blocks
     # (b, 8, 8): limits of the coefficients before rounding
     low: FloatArray
@@ -140,22 +141,22 @@ class CompressedPixels:
         which = np.unique(number[within])
         rows, columns = np.divmod(which, max(width // _SIDE, 1))
         down, across = np.mgrid[:_SIDE, :_SIDE]
-        every = grey[
+        block_values = grey[
             (_SIDE * rows)[:, None, None] + down, (_SIDE * columns)[:, None, None] + across
         ].astype(np.float64)
-        exact = (every.min(axis=(1, 2)) > 0.0) & (every.max(axis=(1, 2)) < _WHITE)
+        exact = (block_values.min(axis=(1, 2)) > 0.0) & (block_values.max(axis=(1, 2)) < _WHITE)
         place = np.full(height * width // _SIDE**2, -1)
         place[which[exact]] = np.arange(np.count_nonzero(exact))
         block = np.full(len(x), -1)
         block[within] = place[number[within]]
         in_blocks = np.flatnonzero(block >= 0)
         flat = _SIDE**2 * block + _SIDE * (y % _SIDE) + x % _SIDE
-        middle = np.rint(_transformed(every[exact]) / steps) * steps
+        middle = np.rint(_transformed(block_values[exact]) / steps) * steps
         return cls(
             in_blocks,
             flat[in_blocks],
             np.flatnonzero(block < 0),
-            every[exact],
+            block_values[exact],
             middle - 0.5 * steps,
             middle + 0.5 * steps,
         )
@@ -177,10 +178,10 @@ class CompressedPixels:
         those that are.
         """
         variance = (_WHITE * sd[self.in_blocks]) ** 2
-        every = np.full(self.observed.size, np.median(variance) if len(variance) else 0.0)
-        every[self.places] = variance
+        variances = np.full(self.observed.size, np.median(variance) if len(variance) else 0.0)
+        variances[self.places] = variance
         square = _COSINES * _COSINES
-        made = square @ every.reshape(self.observed.shape) @ square.T
+        made = square @ variances.reshape(self.observed.shape) @ square.T
         return np.asarray(np.sqrt(np.maximum(made, _MIN_SD_COUNTS**2))).ravel()
 
     def coefficients(self, rows: FloatArray) -> FloatArray:
@@ -235,9 +236,9 @@ def _within(
     probability = ndtr(np.where(below, -low, high)) - ndtr(np.where(below, -high, low))
     possible: BoolArray = probability > _MIN_PROBABILITY
     density = np.stack((_normal(low), _normal(high))) / np.maximum(probability, _MIN_PROBABILITY)
-    off = density[0] - density[1]
-    expected = np.where(possible, mean + sd * off, mean)
-    share = 1.0 + low * density[0] - high * density[1] - off * off
+    mean_shift = density[0] - density[1]
+    expected = np.where(possible, mean + sd * mean_shift, mean)
+    share = 1.0 + low * density[0] - high * density[1] - mean_shift * mean_shift
     variance = np.where(possible, np.clip(share, 0.0, 1.0), 0.0) * sd**2
     return np.clip(expected, bottom, top), variance
 

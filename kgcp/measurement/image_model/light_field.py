@@ -130,9 +130,9 @@ def _add_grid(
     spacing: float,
     counts: tuple[int, int],
     values: FloatArray,
-    seen: FloatArray,
+    result: FloatArray,
 ) -> None:
-    """Add one grid's part to `seen` (4, n): ink, plate, and the gradient x, y of their contrast.
+    """Add one grid's part to `result` (4, n): ink, plate, and the gradient x, y of their contrast.
 
     Sums over the columns of knots are computed first, because consecutive pixels in a row of a cell
     share them.
@@ -160,12 +160,12 @@ def _add_grid(
                 sums[0, c], sums[1, c], sums[2, c] = ink, plate, below
         left, right = 0.5 * (1.0 - across) * (1.0 - across), 0.5 * across * across
         middle = 1.0 - left - right
-        seen[0, i] += left * sums[0, 0] + middle * sums[0, 1] + right * sums[0, 2]
-        seen[1, i] += left * sums[1, 0] + middle * sums[1, 1] + right * sums[1, 2]
+        result[0, i] += left * sums[0, 0] + middle * sums[0, 1] + right * sums[0, 2]
+        result[1, i] += left * sums[1, 0] + middle * sums[1, 1] + right * sums[1, 2]
         rising = (across - 1.0) * (sums[1, 0] - sums[0, 0])
         rising += (1.0 - 2.0 * across) * (sums[1, 1] - sums[0, 1])
-        seen[2, i] += (rising + across * (sums[1, 2] - sums[0, 2])) / spacing
-        seen[3, i] += left * sums[2, 0] + middle * sums[2, 1] + right * sums[2, 2]
+        result[2, i] += (rising + across * (sums[1, 2] - sums[0, 2])) / spacing
+        result[3, i] += left * sums[2, 0] + middle * sums[2, 1] + right * sums[2, 2]
 
 
 @inlined
@@ -203,9 +203,9 @@ class LightField:
     @property
     def penalty(self) -> float:
         """Contribution of the priors to the negative log-likelihood."""
-        of_offsets = 0.5 * LEVEL_OFFSET_PRECISION * float(self.offsets @ self.offsets)
-        of_values = 0.5 * float(np.sum(self.precision * self.values**2))
-        return of_values + of_offsets + self.shadows.penalty
+        for_offsets = 0.5 * LEVEL_OFFSET_PRECISION * float(self.offsets @ self.offsets)
+        for_values = 0.5 * float(np.sum(self.precision * self.values**2))
+        return for_values + for_offsets + self.shadows.penalty
 
     def added(self, pixels: FloatArray) -> FloatArray:
         """Return what is added to the levels of ink and plate (2, n) at pixels (2, n)."""
@@ -213,10 +213,10 @@ class LightField:
 
     def added_with_gradient(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the same as `added`, and the gradient (2, n) [1/px] of plate minus ink."""
-        seen = np.zeros((4, pixels.shape[1]))
+        result = np.zeros((4, pixels.shape[1]))
         for grid in range(len(self.knots.spacings_px)):
-            _add_values(self.knots, grid, self.values[:, self.knots.of_grid(grid)], pixels, seen)
-        added, gradient = seen[:2] + self.offsets[:, None], seen[2:]
+            _add_values(self.knots, grid, self.values[:, self.knots.of_grid(grid)], pixels, result)
+        added, gradient = result[:2] + self.offsets[:, None], result[2:]
         by_shadows, gradient_of_shadows = self.shadows.added_with_gradient(
             self._about_centre(pixels)
         )
@@ -251,23 +251,23 @@ class LightField:
             return light_after(base + added, step) - (base + added + step)
 
         nothing = np.zeros((2, 1))
-        of_offsets = correction(nothing, step)
+        for_offsets = correction(nothing, step)
         edges, values = self.shadows.rows + edges, self.values + values
         for old, new in zip(self.shadows.rows, edges, strict=True):
             amplitude, change = old[INK:, None], (new - old)[INK:, None]
-            new[INK:] += (correction(amplitude, step + change) - of_offsets)[:, 0]
-        added, taken = nothing, of_offsets
+            new[INK:] += (correction(amplitude, step + change) - for_offsets)[:, 0]
+        added, distributed = nothing, for_offsets
         for grid in range(len(self.knots.spacings_px)):
             part = self.knots.of_grid(grid)
             own, own_step = self.values[:, part], values[:, part] - self.values[:, part]
-            change = correction(added + own, step + own_step) - taken
+            change = correction(added + own, step + own_step) - distributed
             values[:, part] += change
             if grid + 1 < len(self.knots.spacings_px):
                 places = self.knots.places_px(grid + 1)
                 added = added + _of_grid(self.knots, grid, own, places)
                 step = step + _of_grid(self.knots, grid, own_step, places)
-                taken = taken + _of_grid(self.knots, grid, change, places)
-        offsets = self.offsets + offsets + of_offsets[:, 0]
+                distributed = distributed + _of_grid(self.knots, grid, change, places)
+        offsets = self.offsets + offsets + for_offsets[:, 0]
         return replace(
             self, values=values, offsets=offsets, shadows=replace(self.shadows, rows=edges)
         )
@@ -283,17 +283,17 @@ def _places_px(knots: Knots, grid: int) -> FloatArray:
 
 
 def _add_values(
-    knots: Knots, grid: int, values: FloatArray, pixels: FloatArray, seen: FloatArray
+    knots: Knots, grid: int, values: FloatArray, pixels: FloatArray, result: FloatArray
 ) -> None:
     """Apply `_add_grid` to the values (2, k) of one grid."""
     counts = knots.columns[grid], knots.rows[grid]
     spacing = knots.spacings_px[grid]
     corner = knots.x0_px[grid], knots.y0_px[grid]
-    _add_grid(pixels, corner, spacing, counts, values.copy(), seen)
+    _add_grid(pixels, corner, spacing, counts, values.copy(), result)
 
 
 def _of_grid(knots: Knots, grid: int, values: FloatArray, pixels: FloatArray) -> FloatArray:
     """Return what one grid with values (2, k) adds to ink and plate at pixels (2, n)."""
-    seen = np.zeros((4, pixels.shape[1]))
-    _add_values(knots, grid, values, pixels, seen)
-    return seen[:2]
+    result = np.zeros((4, pixels.shape[1]))
+    _add_values(knots, grid, values, pixels, result)
+    return result[:2]

@@ -276,9 +276,9 @@ class PhotometricModel:
         """Return the derivatives (6, n) of grey values by `_LEVEL_ROWS` and by the light x."""
         slopes = _tone_curve_derivatives(x, light.values)
         if self.tone.is_srgb:
-            of_curve = np.empty(len(x))
-            encode_pixels(apply_tone(x, light.values), of_curve)
-            slopes *= of_curve
+            curve_slope = np.empty(len(x))
+            encode_pixels(apply_tone(x, light.values), curve_slope)
+            slopes *= curve_slope
         return slopes
 
     def _added(self, added: FloatArray | None) -> FloatArray:
@@ -530,9 +530,9 @@ def _expose(
 ) -> None:
     """Fill in (black + (white − black) · tone(x)) · bulge; see the module's docstring."""
     black, white, _, _, _, tone_1, tone_2, tone_3, _, _, edge_tone = light
-    each = 1 if added.shape[1] > 1 else 0
+    stride = 1 if added.shape[1] > 1 else 0
     for i in range(len(share)):
-        ink, plate = added[0, each * i], 1.0 + added[1, each * i]
+        ink, plate = added[0, stride * i], 1.0 + added[1, stride * i]
         lit, bulge, _ = _lit(offsets[0, i], offsets[1, i], light)
         bent, _ = _edge_toned(share[i], edge_tone)
         x = lit * (ink + (plate - ink) * bent) + (lit - 1.0) * black / (white - black)
@@ -559,9 +559,9 @@ def _expose_with_derivatives(
     black, white, _, _, _, tone_1, tone_2, tone_3, _, _, edge_tone = light
     contrast, gains = white - black, np.empty(len(share))
     has_shape = by_geometry.shape[0] > GEOMETRY_ROWS
-    each = 1 if added.shape[1] > 1 else 0
+    stride = 1 if added.shape[1] > 1 else 0
     for i in range(len(share)):
-        ink, plate = added[0, each * i], 1.0 + added[1, each * i]
+        ink, plate = added[0, stride * i], 1.0 + added[1, stride * i]
         right, down = offsets[0, i], offsets[1, i]
         lit, bulge, by_curvature = _lit(right, down, light)
         bent, by_share = _edge_toned(share[i], edge_tone)
@@ -585,7 +585,7 @@ def _expose_with_derivatives(
         jacobian[_SHARPENING, i] = jacobian[_LINEAR_SHARPENING, i] = 0.0
         if len(jacobian) > _EDGE_TONE:
             jacobian[_EDGE_TONE, i] = 0.0
-        if each:
+        if stride:
             jacobian[_EDGE_TONE, i] = gain * slope * (plate - ink) * share[i] * (1.0 - share[i])
             jacobian[_BY_INK, i] = gain * slope * (1.0 - bent)
             jacobian[_BY_PLATE, i] = gain * slope * bent

@@ -73,131 +73,132 @@ class FoundShadows:
         return bool(plate > high - _BURNT_MARGIN * (plate - ink))
 
 
-def find_shadows(flat: PlateauPixels, tone: Tone) -> list[FoundShadows]:
+def find_shadows(plateaus: PlateauPixels, tone: Tone) -> list[FoundShadows]:
     """Return sets of straight edges that explain the variation of the grey values, smallest first.
 
     Each set adds a step or a strip to the one before. The list is empty if no first step explains
-    enough. `flat` must contain pixels of both kinds.
+    enough. `plateaus` must contain pixels of both kinds.
     """
-    means = np.array([flat.levels[flat.kind == kind].mean() for kind in (0, 1)])
-    sd = _noise_of(flat, float(means[1] - means[0]))
-    seen, found = FoundShadows(means, NO_EDGES), list[FoundShadows]()
-    rest = _rest(seen, flat, sd)
-    while len(seen.edges.rows) < _ENOUGH_EDGES and not (found and rest @ rest < len(rest)):
-        start = _with_best_step(seen, flat, rest, sd)
+    means = np.array([plateaus.levels[plateaus.kind == kind].mean() for kind in (0, 1)])
+    sd = _noise_of(plateaus, float(means[1] - means[0]))
+    shadows, results = FoundShadows(means, NO_EDGES), list[FoundShadows]()
+    residuals = _residuals_of(shadows, plateaus, sd)
+    while len(shadows.edges.rows) < _ENOUGH_EDGES and not (
+        results and residuals @ residuals < len(residuals)
+    ):
+        start = _with_best_step(shadows, plateaus, residuals, sd)
         if start is None:
             break
-        further, after = _adjusted(start, flat, sd)
-        explained = 1.0 - float(after @ after) / float(rest @ rest)
-        least = _MIN_EXPLAINED_OF_REST if found else _MIN_EXPLAINED
-        if explained < least or not _may_be_shade(further, flat.high, tone):
+        extended, new_residuals = _adjusted(start, plateaus, sd)
+        explained = 1.0 - float(new_residuals @ new_residuals) / float(residuals @ residuals)
+        least = _MIN_EXPLAINED_OF_REST if results else _MIN_EXPLAINED
+        if explained < least or not _may_be_shade(extended, plateaus.high, tone):
             break
-        seen, rest = further, after
-        found.append(seen)
-    return found
+        shadows, residuals = extended, new_residuals
+        results.append(shadows)
+    return results
 
 
-def _noise_of(flat: PlateauPixels, contrast: float) -> FloatArray:
+def _noise_of(plateaus: PlateauPixels, contrast: float) -> FloatArray:
     """Return the noise of ink and plate (2,), from differences of successive pixels."""
-    differences = (np.abs(np.diff(flat.levels[flat.kind == kind])) for kind in (0, 1))
+    differences = (np.abs(np.diff(plateaus.levels[plateaus.kind == kind])) for kind in (0, 1))
     least = max(_MIN_NOISE * contrast, _TINY_LEVEL)
     return np.array([max(float(np.median(each)), least) for each in differences])
 
 
-def _rest(seen: FoundShadows, flat: PlateauPixels, sd: FloatArray) -> FloatArray:
+def _residuals_of(shadows: FoundShadows, plateaus: PlateauPixels, sd: FloatArray) -> FloatArray:
     """Return the residuals of the grey values (n,), in units of the noise."""
-    added, _ = seen.edges.added_with_gradient(flat.offsets)
-    ink, plate = seen.sunlit_levels[:, None] + added
-    return np.asarray((flat.levels - np.where(flat.kind, plate, ink)) / sd[flat.kind])
+    added, _ = shadows.edges.added_with_gradient(plateaus.offsets)
+    ink, plate = shadows.sunlit_levels[:, None] + added
+    return np.asarray((plateaus.levels - np.where(plateaus.kind, plate, ink)) / sd[plateaus.kind])
 
 
-def _may_be_shade(seen: FoundShadows, high: float, tone: Tone) -> bool:
+def _may_be_shade(shadows: FoundShadows, high: float, tone: Tone) -> bool:
     """Tell whether shade or highlights can cause all edges.
 
     Ink and plate must change in the same sense. If white is burnt, shade need not show on the
     plate, but it must show on ink, and ink must be as dark as it is without a highlight.
     """
-    if not max(float(seen.sunlit_levels[0]), 0.0) < seen.sunlit_levels[1]:
+    if not max(float(shadows.sunlit_levels[0]), 0.0) < shadows.sunlit_levels[1]:
         return False
-    by_ink, by_plate = seen.edges.rows[:, INK], seen.edges.rows[:, PLATE]
+    by_ink, by_plate = shadows.edges.rows[:, INK], shadows.edges.rows[:, PLATE]
     ratios = by_ink / np.where(by_plate == 0.0, _TINY_LEVEL, by_plate)
     if np.all((ratios > _MIN_INK_RATIO) & (ratios < _MAX_INK_RATIO)):
         return True
-    light = decoded(np.maximum(seen.sunlit_levels, 0.0), Tone.SRGB if tone.is_unknown else tone)
+    light = decoded(np.maximum(shadows.sunlit_levels, 0.0), Tone.SRGB if tone.is_unknown else tone)
     ink, plate = light.tolist()
     against = by_plate * np.sign(by_ink) < -_BURNT_MARGIN
     shows_on_ink = by_ink * (by_ink + by_plate) > 0.0
-    is_dark = seen.is_burnt(high) and ink < _MAX_INK * plate
+    is_dark = shadows.is_burnt(high) and ink < _MAX_INK * plate
     return bool(is_dark and np.all(shows_on_ink & ~against))
 
 
 def _adjusted(
-    start: FoundShadows, flat: PlateauPixels, sd: FloatArray
+    start: FoundShadows, plateaus: PlateauPixels, sd: FloatArray
 ) -> tuple[FoundShadows, FloatArray]:
     """Adjust levels and edges to the grey values (Levenberg–Marquardt).
 
     Returned are the result and its residuals (n,), in units of the noise.
     """
-    by_level = np.stack([(flat.kind == kind) / sd[kind] for kind in (0, 1)])
-    seen, rest, damping = start, _rest(start, flat, sd), _FIRST_DAMPING
-    total = 0.5 * float(rest @ rest) + seen.edges.penalty
+    by_level = np.stack([(plateaus.kind == kind) / sd[kind] for kind in (0, 1)])
+    shadows, residuals, damping = start, _residuals_of(start, plateaus, sd), _FIRST_DAMPING
+    total = 0.5 * float(residuals @ residuals) + shadows.edges.penalty
     for _ in range(_STEPS):
-        rows = np.vstack((by_level, seen.edges.derivatives(flat.offsets, by_level)))
-        gradient = rows @ rest + np.append((0.0, 0.0), seen.edges.pull)
-        normal = rows @ rows.T + np.diag(np.append((0.0, 0.0), seen.edges.precision))
+        rows = np.vstack((by_level, shadows.edges.derivatives(plateaus.offsets, by_level)))
+        gradient = rows @ residuals + np.append((0.0, 0.0), shadows.edges.pull)
+        normal = rows @ rows.T + np.diag(np.append((0.0, 0.0), shadows.edges.precision))
         stiffness = np.diag(normal) + np.finfo(float).tiny
         for _ in range(_TRIALS):
             step = np.linalg.lstsq(normal + np.diag(damping * stiffness), gradient, rcond=None)[0]
-            moved = _moved(seen, step)
-            after = _rest(moved, flat, sd)
-            gain = total - 0.5 * float(after @ after) - moved.edges.penalty
+            moved = _moved(shadows, step)
+            new_residuals = _residuals_of(moved, plateaus, sd)
+            gain = total - 0.5 * float(new_residuals @ new_residuals) - moved.edges.penalty
             if gain > 0.0:
                 break
             damping *= 10.0
         if not gain > 0.0:
             break
-        seen, rest, damping = moved, after, 0.1 * damping
+        shadows, residuals, damping = moved, new_residuals, 0.1 * damping
         total -= gain
         if gain < _SETTLED * total:
             break
-    return seen, rest
+    return shadows, residuals
 
 
-def _moved(seen: FoundShadows, step: FloatArray) -> FoundShadows:
-    rows = seen.edges.rows + step[2:].reshape(-1, 5)
+def _moved(shadows: FoundShadows, step: FloatArray) -> FoundShadows:
+    rows = shadows.edges.rows + step[2:].reshape(-1, 5)
     rows[:, LOG_WIDTH] = np.clip(rows[:, LOG_WIDTH], _MIN_LOG_WIDTH, _MAX_LOG_WIDTH)
-    return FoundShadows(seen.sunlit_levels + step[:2], replace(seen.edges, rows=rows))
+    return FoundShadows(shadows.sunlit_levels + step[:2], replace(shadows.edges, rows=rows))
 
 
 def _with_best_step(
-    seen: FoundShadows, flat: PlateauPixels, rest: FloatArray, sd: FloatArray
+    shadows: FoundShadows, plateaus: PlateauPixels, residuals: FloatArray, sd: FloatArray
 ) -> FoundShadows | None:
     """Add the step or strip that explains most of the residuals; None if there is none.
 
     In the result, single edges come first, each with its shade beyond it.
     """
-    reach_px = float(np.hypot(*flat.offsets).max())
-    in_sun = seen.edges.sunlit_share(flat.offsets) > 0.5  # another shade has no effect elsewhere
-    offsets = np.ascontiguousarray(flat.offsets[:, in_sun])
+    reach_px = float(np.hypot(*plateaus.offsets).max())
+    # another shade has no effect elsewhere
+    in_sun = shadows.edges.sunlit_share(plateaus.offsets) > 0.5
+    offsets = np.ascontiguousarray(plateaus.offsets[:, in_sun])
     gain, angle, first, last, *in_noise = _best_step(
-        offsets, rest[in_sun], flat.kind[in_sun], reach_px
+        offsets, residuals[in_sun], plateaus.kind[in_sun], reach_px
     )
     if gain == 0.0:
         return None
     borders_px, step = np.linspace(-reach_px, reach_px, _BORDERS), np.array(in_noise) * sd
     near_px, far_px = borders_px[[first, last]].tolist()
     width_px = max(1.0, _FIRST_WIDTH * reach_px)
-    rows, singles, sunlit_levels = seen.edges.rows, seen.edges.single_count, seen.sunlit_levels
+    rows, singles, levels = shadows.edges.rows, shadows.edges.single_count, shadows.sunlit_levels
     if last < _BORDERS - 1:
         log_width = math.log(min(width_px, max(1.0, _WIDTH_IN_STRIP * (far_px - near_px))))
         sides = (angle, near_px, log_width, *step), (angle, far_px, log_width, *-step)
-        return FoundShadows(sunlit_levels, ShadowEdges(np.vstack((rows, sides)), singles))
+        return FoundShadows(levels, ShadowEdges(np.vstack((rows, sides)), singles))
     if step.sum() > 0.0:  # the shade is on the other side
-        angle, near_px, sunlit_levels, step = angle + math.pi, -near_px, sunlit_levels + step, -step
+        angle, near_px, levels, step = angle + math.pi, -near_px, levels + step, -step
     row = np.array((angle, near_px, math.log(width_px), *step))
-    return FoundShadows(
-        sunlit_levels, ShadowEdges(np.insert(rows, singles, row, axis=0), singles + 1)
-    )
+    return FoundShadows(levels, ShadowEdges(np.insert(rows, singles, row, axis=0), singles + 1))
 
 
 @compiled

@@ -77,10 +77,10 @@ class Mask:
             Derivatives of the pixels that are not modelled: of ink by its level, of plate by its
             level.
         """
-        of_others = others[0] * self.ink, others[1] * self.plate
+        from_others = others[0] * self.ink, others[1] * self.plate
         unsharpened = self.ink, self.plate, 0.0
         _sharpen_twice(
-            jacobian, rows, self._passes, unsharpened, _NOTHING, _NOTHING, (*of_others, strength)
+            jacobian, rows, self._passes, unsharpened, _NOTHING, _NOTHING, (*from_others, strength)
         )
 
     def sharpen_around_curve(
@@ -112,8 +112,8 @@ class Mask:
             As for `sharpen`, for the grey values.
         """
         before, detail = in_light
-        of_others = others[0] * self.ink, others[1] * self.plate
-        first, second = (self.ink, self.plate, before), (*of_others, strength)
+        from_others = others[0] * self.ink, others[1] * self.plate
+        first, second = (self.ink, self.plate, before), (*from_others, strength)
         _sharpen_twice(jacobian, rows, self._passes, first, detail, slope, second)
         _carry_others(jacobian, rows, rare_rows, self._passes, before, slope, strength)
 
@@ -140,9 +140,11 @@ def unsharp_mask(
     kernel = _gaussian(sigma_px)
     others, plate = np.ones(len(share)), share.copy()
     others[index] = plate[index] = 0.0
-    of_others, of_plate = (_filtered(values.reshape(shape), kernel) for values in (others, plate))
-    ink = (of_others - of_plate).ravel()[index]
-    return Mask(along_rows, along_columns, kernel, ink, of_plate.ravel()[index])
+    from_others, from_plate = (
+        _filtered(values.reshape(shape), kernel) for values in (others, plate)
+    )
+    ink = (from_others - from_plate).ravel()[index]
+    return Mask(along_rows, along_columns, kernel, ink, from_plate.ravel()[index])
 
 
 @lru_cache(maxsize=8)

@@ -88,15 +88,15 @@ def track_edges(
     """
     count = len(radii)
     curves = np.zeros((TERMS, count))
-    numbers, rises = (
+    indices, rises = (
         np.empty((_FIRST_RAYS, count), np.uint8),
         np.empty((_FIRST_RAYS, count), np.uint8),
     )
     residuals = np.empty((_FIRST_RAYS, count))
-    _find_first_edges(frame, reduced, levels, centres, radii, numbers, rises)
-    fill_in_medians(numbers, curves[0])
+    _find_first_edges(frame, reduced, levels, centres, radii, indices, rises)
+    fill_in_medians(indices, curves[0])
     curves[0] = _MIDDLES[0] + _SPACING * curves[0]
-    fit_curves(_MIDDLES[numbers], rises, _FIRST_WAVES, _FIRST_WIDTHS, curves, residuals)
+    fit_curves(_MIDDLES[indices], rises, _FIRST_WAVES, _FIRST_WIDTHS, curves, residuals)
     on_curve = np.count_nonzero(np.abs(residuals) < 2.0 * _INLIER, axis=0)
     rings = np.flatnonzero(on_curve > _FIRST_MIN_INLIERS * _FIRST_RAYS)
 
@@ -130,7 +130,7 @@ def _find_first_edges(
     levels: IndexArray,
     centres: FloatArray,
     radii: FloatArray,
-    numbers: GreyArray,
+    indices: GreyArray,
     rises: GreyArray,
 ) -> None:
     """Fill in the steepest increases outwards on every second ray: sample numbers and sizes."""
@@ -138,13 +138,13 @@ def _find_first_edges(
     for i in range(len(radii)):
         octave = _octave_of(radii[i], levels)
         x, y = (centres[i, 0] + 0.5) / 2.0**octave - 0.5, (centres[i, 1] + 0.5) / 2.0**octave - 0.5
-        radius, number, rise = radii[i] / 2.0**octave, numbers[:, i], rises[:, i]
+        radius, index, rise = radii[i] / 2.0**octave, indices[:, i], rises[:, i]
         if octave == 0:  # separate: the frame may be read-only, which is another type for numba
-            _find_first_edge(frame, x, y, radius, places, values, number, rise)
+            _find_first_edge(frame, x, y, radius, places, values, index, rise)
         else:
             at = levels[2 * octave - 2]
             image = reduced[at[0] : at[1]].reshape((at[2], at[3]))
-            _find_first_edge(image, x, y, radius, places, values, number, rise)
+            _find_first_edge(image, x, y, radius, places, values, index, rise)
 
 
 @compiled
@@ -155,7 +155,7 @@ def _find_first_edge(
     radius: float,
     places: _IntArray,
     values: _IntArray,
-    number: GreyArray,
+    index: GreyArray,
     rise: GreyArray,
 ) -> None:
     """Find the steepest increase outwards on every second ray, without interpolation.
@@ -190,7 +190,7 @@ def _find_first_edge(
             slope = np.int16(np.int16(32 * np.int16(outer[k] - inner[k])) + countdown)
             steepest[k] = max(steepest[k], slope)
     for k in range(_FIRST_RAYS):
-        number[k] = _SLOPES - 1 - steepest[k] % 32
+        index[k] = _SLOPES - 1 - steepest[k] % 32
         rise[k] = max(steepest[k] >> 5, 0)
 
 

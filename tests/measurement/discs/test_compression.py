@@ -154,11 +154,14 @@ def test_the_likelihood_of_coefficients_falls_as_its_derivatives_say() -> None:
     steps = quantisation_steps(photo)
     assert steps is not None
     fits = fits_of(photo, grey)
-    alone = [CompressedPixels.of(photo, fit.sample.pixels.places_px, steps).alone for fit in fits]
+    alone = [
+        CompressedPixels.of(photo, fit.sample.pixels.places_px, steps).outside_blocks
+        for fit in fits
+    ]
     fit = fits[int(np.argmax([len(each) for each in alone]))]
     pixels = pixels_before_compression(fit.sample, steps)
     assert pixels is not None
-    assert len(pixels.alone) > 0
+    assert len(pixels.outside_blocks) > 0
     for row, step in ((0, 1e-5), (2, 1e-5), (int(Row.WHITE), 1e-6), (int(Row.SHARPENING), 1e-5)):
         moved = np.zeros(len(fit.state.vector))
         moved[row] = step
