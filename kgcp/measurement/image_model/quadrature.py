@@ -1,8 +1,10 @@
 """Quadrature rules for blurred discs, and polynomials for the normal distribution.
 
 The radii up to which each rule is used were found by comparison with the noncentral χ² distribution
-(isotropic blur) and with 70 chords (anisotropic blur): the error of every rule stays below 3e-4 of
-the contrast. tests/measurement/image_model/test_blurred_discs.py repeats the comparison.
+(isotropic blur) and with 70 chords (anisotropic blur). The error of any number of chords is below
+3e-4 of the contrast, and so is that of the closed form if the blur is isotropic. Otherwise the
+closed form is off by up to 6e-4, under streaks of up to 8 px by 2e-3 (docs/method.md, "Blurred
+discs"). tests/measurement/image_model/test_blurred_discs.py repeats the comparison.
 """
 
 from __future__ import annotations
@@ -64,7 +66,7 @@ _EDGE_RATIO = 6.0  # of radius to σ, from which the closed form is used
 
 
 def quadrature_for(radius_over_largest: FloatArray, radius_over_smallest: FloatArray) -> IndexArray:
-    """Return the cheapest rules (c,) whose errors stay below 3e-4 of the contrast.
+    """Return the cheapest rules (c,) that are accurate enough; see the module's docstring.
 
     Parameters
     ----------
