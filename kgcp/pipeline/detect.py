@@ -145,9 +145,9 @@ def detect_flight(
     Raises
     ------
     KgcpError
-        If there are no frames, a pattern matches none, the times file or that of the reference
-        poses is bad, `out` cannot be written or is another process's, the scheduler cannot be used,
-        or the frames vanish.
+        If there are no frames, a pattern matches none, a table of some frames would replace one of
+        all, the times file or that of the reference poses is bad, `out` cannot be written or is
+        another process's, the scheduler cannot be used, or the frames vanish.
     """
     stopwatch = Stopwatch()
     out = results_folder(flight.folder) if out is None else Path(out)
@@ -156,6 +156,10 @@ def detect_flight(
         flight = replace(flight, frames_folder=flight.frames_folder.absolute())
     with stopwatch.stage("preparation"):
         task = _prepared_task(flight, settings, options)
+        if options.frame_patterns:
+            from kgcp.io.tables.staleness import refuse_to_replace_whole
+
+            refuse_to_replace_whole(out / DETECTIONS)
     job = _job_of(task)
     path, is_new = out / ".detections.journal", options.is_restart
     with Journal(path, _dependencies(job), (FrameResult,), is_new=is_new) as journal:

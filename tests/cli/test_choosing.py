@@ -76,3 +76,20 @@ def test_all_frames_go_on_where_some_frames_were_interrupted(
     assert (summary.frames, summary.kept) == (5, 1)
     whole = detect_flight(flight, out=tmp_path / "whole", options=RunOptions(jobs=0))
     assert summary.table.read_bytes() == whole.table.read_bytes()
+
+
+def test_some_frames_do_not_replace_the_table_of_all(
+    unmeasured: SampleFlight, tmp_path: Path
+) -> None:
+    assert unmeasured.run("detect", *FEW).exit_code == 0
+    assert unmeasured.run("detect", *FEW).exit_code == 0  # that of some may be replaced
+    assert unmeasured.run("detect", "--jobs", "0").exit_code == 0
+    table = unmeasured.out / "detections.parquet"
+    whole = table.read_bytes()
+    message = unmeasured.fails("detect", *FEW)
+    assert f"{table}: has the detections of all frames, which would be lost" in message
+    assert "(--frames)" in message
+    assert table.read_bytes() == whole
+    assert unmeasured.run("detect", *FEW, "--out", str(tmp_path / "few")).exit_code == 0
+    table.write_bytes(b"damaged")
+    assert unmeasured.run("detect", *FEW).exit_code == 0

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 from kgcp.errors import KgcpError
@@ -36,6 +37,28 @@ _SAME_SHIFT_S = 1e-3  # spread of differences that are called one shift
 _LONGEST_VALUE = 40  # characters of a value that is shown
 _MOST_SHOWN = 6  # changes that are named one by one
 _CAMERA_KEYS = {f"[camera] {field.name}" for field in fields(Camera)}  # every table has them
+
+
+def refuse_to_replace_whole(path: Path) -> None:
+    """Refuse to replace a table of all frames by one of some: that of all took the longer work.
+
+    A table of some frames, and what is no table, may be replaced.
+
+    Raises
+    ------
+    KgcpError
+        If the table has all frames of its flight.
+    """
+    try:
+        metadata = pq.read_schema(path).metadata or {}
+    except (OSError, pa.ArrowException):  # there is none, or it is damaged
+        return
+    if b"kgcp.inputs" in metadata and b"kgcp.choice" not in metadata:
+        raise KgcpError(
+            f"{path}: has the detections of all frames, which would be lost; name another folder"
+            " with --out, or delete this table",
+            option="frames",
+        )
 
 
 def require_current(path: Path, table: pd.DataFrame, flight: Flight) -> None:
