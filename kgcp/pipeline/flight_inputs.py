@@ -231,7 +231,8 @@ class FlightInputs:
             *self._doubts_of_times(),
         ]
         if flight.vehicle is not None:
-            doubts += check_lever_arm(flight.vehicle.settings)
+            moving = [each.name for each in flight.all_targets if each.position_m is None]
+            doubts += check_lever_arm(flight.vehicle.settings, moving)
             doubts += check_vehicle_deviations(flight.vehicle.settings)
         if self.target_positions is not None and not _has_wrong_places(doubts):
             doubts += check_attitude(self.course)

@@ -70,7 +70,7 @@ class Cause(StrEnum):
         "standard_deviations",
         "standard deviations are 0, as of nothing measured, or seem to be in another unit",
     )
-    LEVER_ARM = "lever_arm", "an axis of the lever arm has the wrong sign, place or unit"
+    LEVER_ARM = "lever_arm", "an axis of the lever arm is wrong, or several targets share it"
     MOUNT = "mount_deg", "the plate is mounted in another direction than mount_deg says"
     HEIGHTS = "heights", "heights are of another kind: above the geoid, or above ground"
     CLOCK = "clock", "times are of another clock: leap seconds, hours, days or GPS weeks"

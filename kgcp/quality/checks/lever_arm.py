@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from kgcp.quality.checks.doubt import Cause, Doubt, mild
 from kgcp.settings import VehicleSettings
@@ -12,8 +12,23 @@ _DEEPEST_M = 1.0  # below the trajectory point: an antenna on a mast beside the 
 _LONGEST_M = 10.0
 
 
-def check_lever_arm(settings: VehicleSettings) -> Iterator[Doubt]:
-    """Tell a target below the vehicle, or beyond its length."""
+def check_lever_arm(settings: VehicleSettings, on_vehicle: Sequence[str]) -> Iterator[Doubt]:
+    """Tell a target below the vehicle, or beyond its length, and several at one place.
+
+    Parameters
+    ----------
+    on_vehicle : sequence of str
+        Names of the targets that do not stand still.
+    """
+    if len(on_vehicle) > 1:
+        yield mild(
+            Cause.LEVER_ARM,
+            f"targets {' and '.join(on_vehicle)} share one lever arm: export-gcp refuses them if"
+            " more than one is measured",
+            "give position_m to those that stand still, and leave out those that are not on this"
+            " vehicle",
+            {"targets": float(len(on_vehicle))},
+        )
     forward, right, down = settings.lever_arm_m
     figures = {"forward_m": forward, "right_m": right, "down_m": down}
     if math.hypot(forward, right, down) > _LONGEST_M:

@@ -90,9 +90,11 @@ def test_a_vehicle_that_stands_has_no_course() -> None:
 def test_lever_arms_in_words_and_beyond_belief() -> None:
     arm = VehicleSettings(lever_arm_m=(-0.8, 0.15, -1.95))
     assert lever_arm_text(arm) == "0.80 m behind, 0.15 m to the right, 1.95 m above"
-    assert not [*check_lever_arm(arm)]
-    (below,) = check_lever_arm(VehicleSettings(lever_arm_m=(-0.8, 0.15, 1.95)))
+    assert not [*check_lever_arm(arm, ["A"])]
+    (below,) = check_lever_arm(VehicleSettings(lever_arm_m=(-0.8, 0.15, 1.95)), ["A"])
     assert "1.95 m below" in below.sentence
     assert "lever_arm_m[2] = -1.95" in below.remedy
-    (far,) = check_lever_arm(VehicleSettings(lever_arm_m=(-80.0, 15.0, 0.0)))
+    (far,) = check_lever_arm(VehicleSettings(lever_arm_m=(-80.0, 15.0, 0.0)), ["A"])
     assert "81.4 m long" in far.sentence
+    (shared,) = check_lever_arm(arm, ["A", "B"])
+    assert "targets A and B share one lever arm" in shared.sentence
