@@ -19,7 +19,9 @@ from typing import Any
 
 OPEN_FLAGS: int = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_CLOEXEC", "O_BINARY"))
 """For `os.open`, as far as the system has them: no links, not for child processes, no new lines."""
-_BEYOND = 1 << 40  # byte that Windows locks: those that are written stay readable
+# Byte that Windows locks, beyond all that is written, which stays readable. C libraries may take
+# its position for a number of 32 bits.
+_BEYOND = (1 << 31) - 2
 _BYTES_PER_KB = 1024
 _PAUSES_S = (0.05, 0.1, 0.2, 0.4, 0.8)  # before what Windows has refused is tried again
 
