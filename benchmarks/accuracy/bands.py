@@ -104,7 +104,7 @@ def _pose_errors(right: pd.DataFrame) -> pd.DataFrame:
     """Return the errors of pose, and all errors in units of their standard deviations."""
     elements = [f"r{row}{column}" for row in range(3) for column in range(3)]
     true_rotation = right[elements].to_numpy(float).reshape(-1, 3, 3)
-    quaternions = right[["qw", "qx", "qy", "qz"]].to_numpy(float).reshape(-1, 4)
+    quaternions = np.array(right[["qw", "qx", "qy", "qz"]], float).reshape(-1, 4)
     rotation = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
     true_m = right[["cx", "cy", "cz"]].to_numpy(float)
     error_m = true_m - right[["tx_m", "ty_m", "tz_m"]].to_numpy(float)

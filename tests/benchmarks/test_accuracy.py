@@ -262,6 +262,14 @@ def test_wrong_and_missing_targets_are_counted_and_have_no_errors() -> None:
     assert table["mahalanobis2"].count() == 7
 
 
+def test_flights_in_which_nothing_is_found_have_no_errors() -> None:
+    truth, rows = random_flight(5, COVARIANCE)
+    rows["status"] = "not_found"
+    table = join_truth(rows, truth)
+    assert summarise(table)[0].found == 0
+    assert table["mahalanobis2"].count() == 0
+
+
 def test_methods_without_sigmas_leave_dashes() -> None:
     truth, rows = random_flight(5, COVARIANCE)
     rows[["sd_x_px", "sd_y_px", "sd_distance_m"]] = np.nan
