@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
-from benchmarks.accuracy import disturbed, evaluate, flights, presets, sampling
+from benchmarks.accuracy import disturbed, evaluate, flights, presets, processed, sampling
 from benchmarks.accuracy.bands import join_truth, summarise, table_lines
 from benchmarks.accuracy.bound import frame_bound
 from kgcp.geometry.camera import Camera
@@ -317,6 +317,28 @@ def test_flights_have_a_line_each(flight: tuple[Path, pd.DataFrame]) -> None:
     assert "wrong side" in title
     assert line.split()[:2] == [folder.name, "3/3"]
     assert line.split()[-1].startswith("0/")
+
+
+@pytest.mark.parametrize("shape", [(96, 160), (96, 160, 3)])
+def test_processing_changes_pixels_alone(shape: tuple[int, ...]) -> None:
+    pixels = np.random.default_rng(0).integers(40, 200, shape).astype(np.uint8)
+    for name, process in processed.PROCESSINGS.items():
+        changed = process(pixels)
+        assert (changed.shape, changed.dtype) == (pixels.shape, pixels.dtype)
+        is_same = name == "as it is" or name.startswith("JPEG")
+        assert np.array_equal(changed, pixels) == is_same, name
+
+
+def test_processed_flights_have_a_line_for_each_processing(
+    flight: tuple[Path, pd.DataFrame],
+) -> None:
+    folder, _ = flight
+    arguments = [str(folder), "--jobs", "1", "--only", "JPEG 70", "--only", "interlaced"]
+    printed = CliRunner().invoke(processed.main, arguments, catch_exceptions=False)
+    _, title, compressed, interlaced = printed.stdout.splitlines()
+    assert "wrong side" in title
+    assert compressed.split()[:3] == ["JPEG", "70", "3/3"]
+    assert interlaced.split()[:2] == ["interlaced", "0/3"]
 
 
 def test_errors_of_the_renderer_widen_the_deviations() -> None:

@@ -1,0 +1,154 @@
+"""Flights whose frames went through processing that the image model does not know.
+
+Usage: python -m benchmarks.accuracy.processed FLIGHT... [--only median] [--jobs 2]
+
+Every processing is applied to the frames of a flight, whose response is then declared unknown. The
+lines are those of `benchmarks.accuracy.flights`. They show whether deviations stay true, and
+whether what cannot be measured is rejected.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import click
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from benchmarks.accuracy.bands import join_truth, read_truth
+from benchmarks.accuracy.evaluate import detect
+from benchmarks.accuracy.flights import HEADER, line_of
+from kgcp.io.flight.flight import read_flight
+from kgcp.io.images.frames import list_frames
+from kgcp.pipeline.execution.resilient_map import usable_cores
+from kgcp.settings import DetectSettings
+
+Pixels = npt.NDArray[np.uint8]  # (rows, columns) or (rows, columns, 3)
+_QUALITY = 95  # of JPEGs that are written again
+_SPOILT_SHARE, _SEED = 0.001, 3  # of the pixels
+
+
+def _rounded(values: npt.NDArray[np.floating]) -> Pixels:
+    return np.asarray(np.clip(np.rint(values), 0.0, 255.0), np.uint8)
+
+
+def _spoilt(pixels: Pixels, value: int) -> Pixels:
+    """Return the frame with a thousandth of its pixels stuck at a value."""
+    changed = pixels.copy()
+    changed[np.random.default_rng(_SEED).random(pixels.shape[:2]) < _SPOILT_SHARE] = value
+    return changed
+
+
+def _for_colours(pixels: Pixels, values: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+    """Return values of rows (rows, 1) or of columns (1, columns) that apply to all colours."""
+    return values[..., None] if pixels.ndim > values.ndim else values
+
+
+def _banded(pixels: Pixels) -> Pixels:
+    """Return the frame as a rolling shutter sees a lamp that flickers: ± 2 % in 44 rows."""
+    flicker = 1.0 + 0.02 * np.sin(np.arange(len(pixels))[:, None] / 7.0)
+    return _rounded(pixels * _for_colours(pixels, flicker))
+
+
+def _noisy_columns(pixels: Pixels) -> Pixels:
+    """Return the frame with an offset of each column, σ 2 grey values."""
+    offsets = np.random.default_rng(_SEED).normal(0.0, 2.0, (1, pixels.shape[1]))
+    return _rounded(pixels + _for_colours(pixels, offsets))
+
+
+def _enlarged(pixels: Pixels) -> Pixels:
+    """Return the frame reduced to half its size, and enlarged to its size again."""
+    height, width = pixels.shape[:2]
+    half = cv2.resize(pixels, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(half, (width, height), interpolation=cv2.INTER_CUBIC), np.uint8)
+
+
+def _contrast_by_tiles(pixels: Pixels) -> Pixels:
+    """Return the frame with the histograms of its tiles stretched (CLAHE)."""
+    stretch = cv2.createCLAHE(2.0, (8, 8)).apply
+    layers = [stretch(np.ascontiguousarray(layer)) for layer in np.atleast_3d(pixels).T]
+    return np.asarray(np.stack(layers).T.reshape(pixels.shape), np.uint8)
+
+
+def _less_blurred(pixels: Pixels, sigma_px: float, strength: float) -> Pixels:
+    """Return the frame with so much of what a Gaussian blur takes away added to it."""
+    blurred = cv2.GaussianBlur(pixels.astype(np.float32), (0, 0), sigma_px)
+    return _rounded(pixels + strength * (pixels - blurred))
+
+
+def _interlaced(pixels: Pixels) -> Pixels:
+    """Return the frame with every second row displaced by 2 px."""
+    changed = pixels.copy()
+    changed[1::2] = np.roll(pixels, 2, axis=1)[1::2]
+    return changed
+
+
+PROCESSINGS: Mapping[str, Callable[[Pixels], Pixels]] = {
+    "as it is": lambda pixels: pixels,
+    "hot pixels": lambda pixels: _spoilt(pixels, 255),
+    "dead pixels": lambda pixels: _spoilt(pixels, 0),
+    "flicker": _banded,
+    "column noise": _noisy_columns,
+    "32 grey values": lambda pixels: _rounded(8.0 * np.rint(pixels / 8.0)),
+    "haze": lambda pixels: _rounded(0.3 * pixels + 120.0),
+    "gamma": lambda pixels: _rounded(255.0 * np.sqrt(pixels / 255.0)),
+    "median": lambda pixels: np.asarray(cv2.medianBlur(pixels, 3), np.uint8),
+    "bilateral": lambda pixels: np.asarray(cv2.bilateralFilter(pixels, 7, 25.0, 3.0), np.uint8),
+    "enlarged": _enlarged,
+    "sharpened": lambda pixels: _less_blurred(pixels, 2.0, 1.5),
+    "local contrast": lambda pixels: _less_blurred(pixels, 15.0, 0.5),
+    "CLAHE": _contrast_by_tiles,
+    "JPEG 70": lambda pixels: pixels,
+    "JPEG 40": lambda pixels: pixels,
+    "interlaced": _interlaced,
+}
+"""What becomes of the pixels of a frame, by name; that of JPEGs when they are written."""
+
+
+def process_flight(flight: Path, name: str, out: Path) -> None:
+    """Write a flight with processed frames and an unknown response into a folder."""
+    frames = read_flight(flight).frames_folder
+    shutil.copytree(flight, out, copy_function=shutil.copyfile)
+    settings = out / "flight.toml"
+    settings.write_text(
+        re.sub(r"(?m)^response = .*$", 'response = "unknown"', settings.read_text("utf-8")), "utf-8"
+    )
+    quality = int(name.removeprefix("JPEG ")) if name.startswith("JPEG ") else _QUALITY
+    for frame in list_frames(frames):
+        pixels = cv2.imread(str(frames / frame), cv2.IMREAD_UNCHANGED)
+        if pixels is None or pixels.dtype != np.uint8:
+            raise click.UsageError(f"{frames / frame}: is no frame of 8 bits")
+        is_jpeg = name.startswith("JPEG ") or Path(frame).suffix.lower() in {".jpg", ".jpeg"}
+        _, encoded = cv2.imencode(
+            ".jpg" if is_jpeg else ".png",
+            PROCESSINGS[name](pixels.astype(np.uint8)),
+            [cv2.IMWRITE_JPEG_QUALITY, quality] if is_jpeg else [],
+        )
+        (out / frames.relative_to(flight) / frame).write_bytes(encoded.tobytes())
+
+
+@click.command()
+@click.argument("flights", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--only", type=click.Choice(list(PROCESSINGS)), multiple=True)
+@click.option("--jobs", type=click.IntRange(1, 256), default=None)
+def main(flights: tuple[Path, ...], only: tuple[str, ...], jobs: int | None) -> None:
+    """Print a table for each flight."""
+    for flight in flights:
+        beside = flight.parent / "truth.csv"
+        truth = read_truth(flight / "truth.csv" if (flight / "truth.csv").exists() else beside)
+        print(f"{flight}\n{HEADER}", flush=True)
+        for name in only or PROCESSINGS:
+            with tempfile.TemporaryDirectory(prefix="kgcp_processed_") as folder:
+                out = Path(folder) / "flight"
+                process_flight(flight, name, out)
+                found = detect(out, DetectSettings(), jobs or usable_cores())
+                print(line_of(name, read_flight(out), join_truth(found, truth)), flush=True)
+
+
+if __name__ == "__main__":
+    main()
