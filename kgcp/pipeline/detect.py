@@ -18,6 +18,7 @@ from kgcp.io.tables.columns import Row
 from kgcp.io.tables.detections import DETECTION_COLUMNS, detection_rows
 from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.provenance import detections_provenance, versions, write_run_record
+from kgcp.io.tables.staleness import refuse_to_replace_whole
 from kgcp.measurement.frame import examine
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import FrameResult
@@ -157,8 +158,6 @@ def detect_flight(
     with stopwatch.stage("preparation"):
         task = _prepared_task(flight, settings, options)
         if options.frame_patterns:
-            from kgcp.io.tables.staleness import refuse_to_replace_whole
-
             refuse_to_replace_whole(out / DETECTIONS)
     job = _job_of(task)
     path, is_new = out / ".detections.journal", options.is_restart
