@@ -1,4 +1,4 @@
-"""Least-squares adjustment of a network, robust against discs that are not what they seem."""
+"""Least-squares adjustment of a network, robust against misidentified or badly measured discs."""
 
 from __future__ import annotations
 
@@ -30,31 +30,35 @@ from kgcp.network.point_elimination import (
 from kgcp.network.records import Estimate, Network, Solution
 
 _FIRST_DAMPING = 1e-4
-_MOST_DAMPING = 1e12
-_CONVERGED = 1e-8  # relative decrease of the cost
-_MOST_STEPS = 100
-_ROUND_STEPS = 2  # between two reweightings, which change the minimum anyway
-_SETTLED_WEIGHT = 0.05  # change of a weight between two rounds
-_HUBER = 2.0  # in units of the robust deviation of a disc's residual
-_MEDIAN_OF_TWO = math.sqrt(2.0 * math.log(2.0))  # of the norm of two standard normal numbers
-_LEAST_DEVIATION = 0.1  # of the stated one: discs that fit better than that are no outliers
-_ROUNDS = 12
-# Discs of a photograph that are kept whatever their residuals: fewer might determine no pose.
-_LEAST_DISCS, _LEAST_SHARE = 6, 1.0 / 3.0
-_WORST_PHOTOGRAPH = 10.0  # deviation of its discs over that of all
+_MAX_DAMPING = 1e12
+_CONVERGED = 1e-8  # relative decrease of the cost at which the iteration ends
+_MAX_STEPS = 100
+_ROUND_STEPS = 2  # steps per round of reweighting: the next weights move the minimum anyway
+_MAX_ROUNDS = 12
+_SETTLED_WEIGHT = 0.05  # weights that change by less between two rounds have settled
+_HUBER = 2.0  # residual from which weights fall, in robust standard deviations
+_MEDIAN_NORM = math.sqrt(2.0 * math.log(2.0))  # of two standard normal numbers
+# Lower limit of the robust standard deviation, relative to the stated one. If all discs fit better
+# than stated, none is an outlier.
+_MIN_DEVIATION = 0.1
+# The best-fitting discs of each photograph are kept whatever their residuals: at least so many, and
+# at least this share. Fewer might not determine the pose.
+_MIN_DISCS, _MIN_SHARE = 6, 1.0 / 3.0
+# Upper limit of a photograph's own robust standard deviation, relative to that of all discs.
+_MAX_PHOTOGRAPH_DEVIATION = 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class Robustness:
-    """What is done about discs that do not fit.
+    """Treatment of discs that do not fit.
 
     Attributes
     ----------
     is_huber : bool
-        Whether residuals beyond twice the robust deviation count less.
+        Whether residuals beyond twice the robust standard deviation are downweighted.
     rejection : float
-        Discs with residuals beyond this multiple of the robust deviation are rejected as a whole;
-        infinite: none.
+        Limit of the residuals, as a multiple of the robust standard deviation. Discs beyond it are
+        rejected, both coordinates together; infinite: none are.
     """
 
     is_huber: bool = True
@@ -70,24 +74,25 @@ ROBUST = Robustness()
 def adjust_network(network: Network, start: Estimate, robustness: Robustness = ROBUST) -> Solution:
     """Adjust cameras, poses and points to the observed discs.
 
-    Gauss-Newton with Levenberg's damping, in rounds of reweighting. The poses are eliminated
-    photograph by photograph. A free network gets inner constraints.
+    The method is Gauss-Newton with Levenberg's damping, in rounds of reweighting. Poses are
+    eliminated photograph by photograph, or points one by one if that is possible. A free network
+    gets inner constraints.
 
     Parameters
     ----------
     start : Estimate
-        Close enough that all points lie on their side of the camera.
+        Approximate values; all points must lie in front of the cameras.
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        If an unknown is not determined at all, not even by a prior.
+        If an unknown is determined neither by observations nor by a prior.
     """
     count = len(network.observations.view)
     weights, is_used = np.ones(count), np.ones(count, dtype=np.bool_)
     estimate = start
     if robustness != PLAIN:
-        for _ in range(_ROUNDS):
+        for _ in range(_MAX_ROUNDS):
             estimate = _minimise(network, estimate, weights, _ROUND_STEPS)
             next_weights, next_used = _reweighted(network, estimate, robustness)
             is_stable = np.array_equal(next_used, is_used) and np.allclose(
@@ -96,23 +101,23 @@ def adjust_network(network: Network, start: Estimate, robustness: Robustness = R
             weights, is_used = next_weights, next_used
             if is_stable:
                 break
-    estimate = _minimise(network, estimate, weights, _MOST_STEPS)
+    estimate = _minimise(network, estimate, weights, _MAX_STEPS)
     residuals = network.observations.places - computed(network, estimate)
     return Solution(estimate, residuals, is_used, weights)
 
 
 def _minimise(
-    network: Network, estimate: Estimate, weights: FloatArray, most_steps: int
+    network: Network, estimate: Estimate, weights: FloatArray, max_steps: int
 ) -> Estimate:
-    """Return the estimate with the least weighted sum of squares."""
+    """Return the estimate that minimises the weighted sum of squares."""
     damping = _FIRST_DAMPING
     cost = _cost(network, estimate, weights)
-    for _ in range(most_steps):
+    for _ in range(max_steps):
         equations = view_rows(network, estimate, weights)
         while True:
             trial = _stepped(network, estimate, equations, damping)
             trial_cost = _cost(network, trial, weights)
-            if trial_cost <= cost or damping > _MOST_DAMPING:
+            if trial_cost <= cost or damping > _MAX_DAMPING:
                 break
             damping *= 10.0
         if trial_cost > cost:
@@ -129,8 +134,8 @@ def _stepped(
     network: Network, estimate: Estimate, equations: list[ViewRows], damping: float
 ) -> Estimate:
     if can_eliminate_points(network):
-        by_points = reduce_points(network, estimate, equations, damping)
-        return moved_by_points(network, estimate, by_points)
+        reduced = reduce_points(network, estimate, equations, damping)
+        return moved_by_points(network, estimate, reduced)
     system = reduce_poses(network, estimate, equations, damping)
     return moved(network, estimate, system, _solved(network, estimate, system))
 
@@ -143,7 +148,10 @@ def _cost(network: Network, estimate: Estimate, weights: FloatArray) -> float:
 
 
 def _solved(network: Network, estimate: Estimate, system: ReducedSystem) -> FloatArray:
-    """Return the step (u,); with inner constraints the field as a whole stays where it is."""
+    """Return the step (u,) of the reduced unknowns.
+
+    Inner constraints keep the mean position, orientation and scale of the nominal points.
+    """
     scale = scales_of(system.normal)
     scaled = system.normal * np.outer(scale, scale)
     if network.points.datum_defect == 0:
@@ -161,23 +169,24 @@ def _solved(network: Network, estimate: Estimate, system: ReducedSystem) -> Floa
 def _reweighted(
     network: Network, estimate: Estimate, robustness: Robustness
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the weight of every disc, and which are kept: of a photograph always the best."""
+    """Return the weight of every disc (n,) and whether it is kept (n,)."""
     observations = network.observations
     residuals = observations.places - computed(network, estimate)
     sizes = np.linalg.norm(whitened(network, residuals, np.ones(len(residuals))), axis=1)
-    # photographs fit differently well, so that discs are also compared within each of them
-    overall = max(float(np.median(sizes)) / _MEDIAN_OF_TWO, _LEAST_DEVIATION)
-    own = [
-        float(np.median(sizes[observations.view == view])) / _MEDIAN_OF_TWO
+    # Some photographs fit worse than others as a whole. A disc is an outlier only relative to its
+    # own photograph.
+    overall = max(float(np.median(sizes)) / _MEDIAN_NORM, _MIN_DEVIATION)
+    of_views = [
+        float(np.median(sizes[observations.view == view])) / _MEDIAN_NORM
         for view in range(len(network.view_camera))
     ]
-    deviation = np.clip(own, overall, _WORST_PHOTOGRAPH * overall)[observations.view]
+    deviation = np.clip(of_views, overall, _MAX_PHOTOGRAPH_DEVIATION * overall)[observations.view]
     limit = robustness.rejection * deviation
     is_used = sizes <= limit
     for view in range(len(network.view_camera)):
-        mine = np.flatnonzero(observations.view == view)
-        count = max(_LEAST_DISCS, math.ceil(_LEAST_SHARE * len(mine)))
-        best = mine[np.argsort(sizes[mine], kind="stable")[:count]]
+        in_view = np.flatnonzero(observations.view == view)
+        count = max(_MIN_DISCS, math.ceil(_MIN_SHARE * len(in_view)))
+        best = in_view[np.argsort(sizes[in_view], kind="stable")[:count]]
         is_used[best] = True
     weights = is_used.astype(np.float64)
     if robustness.is_huber:

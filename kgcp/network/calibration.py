@@ -33,31 +33,33 @@ from kgcp.network.start import better_poses, homography_misfits, start_camera_an
 from kgcp.targets.fields.points import AnyField
 
 LEAST_VIEWS = 3
-_INFLATION = 100.0  # of a variance by other parameters: a deviation ten times larger
-_LEAST_SHARE = 0.6  # of a photograph's discs that must fit
-_MARGIN_PX = 2.0  # within the frame, where a disc is to be found
-_MOST_MISFIT = 0.1  # of a photograph's homography, over the spread of its discs
+# Parameters are tangled if correlation inflates the variance of one of them by more than this
+# factor, that is its standard deviation tenfold.
+_MAX_INFLATION = 100.0
+_MIN_SHARE = 0.6  # share of a photograph's discs that must fit
+_MARGIN_PX = 2.0  # between the frame's edge and a missing disc that is worth searching for
+_MAX_MISFIT = 0.1  # RMS of a photograph's homography, relative to the spread of its discs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Chosen:
-    """The adjustment of what is worth estimating."""
+    """The adjustment with the parameters that are worth estimating."""
 
-    problem: CalibrationProblem  # with the discs of turned photographs named accordingly
+    problem: CalibrationProblem  # discs are renamed where a symmetric field lies turned
     state: AdjustedNetwork
-    fixed: AdjustedNetwork  # the field as it is stated
+    fixed: AdjustedNetwork  # the same with the field as stated
     points: PointModel
-    is_turn_unclear: bool
+    is_turn_unclear: bool  # as in `CameraCalibration`
 
 
 def missing_discs(calibration: CameraCalibration) -> dict[str, tuple[IndexArray, FloatArray]]:
-    """Return the discs that a photograph must show and that were not measured.
+    """Return the discs that must be visible in a photograph but were not measured.
 
     Returns
     -------
     dict
-        By photograph: indices of the field's discs (k,), and the centroids and moments (k, 5) of
-        their images.
+        For every photograph: indices of the field's discs (k,), and expected centroids and moments
+        (k, 5) of their images.
     """
     field, camera = calibration.field, calibration.camera
     estimate = calibration.solution.estimate
@@ -84,21 +86,21 @@ def calibrate_camera(
 ) -> CameraCalibration:
     """Return the camera that took the photographs.
 
-    The field is taken as it is meant to be, then as stiff or free as asked for. The poses of planar
-    fields are followed in both their forms. Centroids are reduced by their eccentricity, exactly
-    and through the lens, until it does not change.
+    The field is first held at its stated coordinates, then made stiff or free as the settings ask.
+    Both possible poses of a planar field are tried. Centroids are corrected for eccentricity,
+    rigorously including distortion, until the correction settles.
 
     Parameters
     ----------
     size : tuple of int
         Width and height of the photographs [px].
     start : CameraCalibration, optional
-        A former calibration by the same photographs.
+        An earlier calibration from the same photographs.
 
     Raises
     ------
     KgcpError
-        If fewer than three photographs show the field, or they determine nothing.
+        If fewer than three photographs show the field, or they do not determine the camera.
     """
     _require_views(views)
     try:
@@ -111,12 +113,12 @@ def calibrate_camera(
 
 
 def _calibrated(problem: CalibrationProblem, start: CameraCalibration | None) -> CameraCalibration:
-    """Calibrate from nothing, or go on from an earlier calibration: see `calibrate_camera`."""
+    """Calibrate without approximate values, or from an earlier calibration."""
     field = problem.field
     if start is not None:
         problem = replace(problem, field=start.field)
     points = field.points_m()
-    # only the photographs dropped by the earlier calibration are dropped now
+    # an earlier calibration has already dropped disordered photographs
     disordered = () if start is not None else _disordered(problem)
     problem = replace(problem, views=tuple(v for v in problem.views if v.photo not in disordered))
     _require_views(problem.views, disordered)
@@ -132,7 +134,7 @@ def _calibrated(problem: CalibrationProblem, start: CameraCalibration | None) ->
         problem = replace(
             problem, views=tuple(v for v in problem.views if v.photo not in start.dropped)
         )
-        estimate = replace(start.solution.estimate, points=points)  # as they are meant to be
+        estimate = replace(start.solution.estimate, points=points)  # at their stated coordinates
         state = problem.adjusted(start.camera, estimate, unknowns)
     state = _with_better_twins(problem, state)
     if not field.is_diameter_stated and start is None:
@@ -150,12 +152,12 @@ def _calibrated(problem: CalibrationProblem, start: CameraCalibration | None) ->
 
 
 def _chosen(problem: CalibrationProblem, state: AdjustedNetwork) -> _Chosen:
-    """Return the adjustment of what is worth estimating, from one of the field as it is stated."""
+    """Choose the parameters, starting from an adjustment with the field as stated."""
     fixed = with_chosen_parameters(problem, state)
     points = problem.settings.points
     if points is PointModel.FIXED:
         return _Chosen(problem, fixed, fixed, points, is_turn_unclear=False)
-    # with k1 and k2 only, and all others once the field has its shape: they would follow its errors
+    # k1 and k2 alone until the field has its true shape: more terms would absorb its errors
     state = problem.adjusted(state.camera, state.estimate, replace(state.unknowns, points=points))
     is_turn_unclear = False
     if any(view.is_symmetric for view in problem.views):
@@ -167,9 +169,9 @@ def _chosen(problem: CalibrationProblem, state: AdjustedNetwork) -> _Chosen:
 
 
 def _with_bends(chosen: _Chosen) -> _Chosen:
-    """Let the field bend from photograph to photograph, if it does.
+    """Let the field bend differently in every photograph, if the residuals show that it does.
 
-    Only now: a photograph in which it is bent much more than in others is left out before.
+    This comes last, because a photograph with a much larger bend must be left out before.
     """
     problem = chosen.problem
     bent = problem.bent(chosen.state)
@@ -192,24 +194,24 @@ def _require_views(views: Sequence[NamedView], disordered: Sequence[str] = ()) -
 
 
 def _disordered(problem: CalibrationProblem) -> tuple[str, ...]:
-    """Return the photographs whose discs do not lie like those of a plane, with these names."""
+    """Return the photographs whose named discs do not match a plane."""
     if not problem.field.starts_from_homographies:
         return ()
     misfits = homography_misfits(problem.observations(), problem.field.points_m())
     return tuple(
         view.photo
         for view, misfit in zip(problem.views, misfits, strict=True)
-        if misfit > _MOST_MISFIT
+        if misfit > _MAX_MISFIT
     )
 
 
 def _with_better_twins(problem: CalibrationProblem, state: AdjustedNetwork) -> AdjustedNetwork:
-    """Try the other pose of every photograph with the camera as it is now."""
+    """Try the mirrored pose of every photograph, now that the camera is better known."""
     kept = state.network.observations.chosen(state.solution.is_used)
     points = state.estimate.points
     poses, _ = better_poses(state.camera, kept, points, state.poses)
-    flipped = np.abs(poses.rotations - state.estimate.rotations).max(axis=(1, 2)) > 0.02
-    if not flipped.any():
+    is_flipped = np.abs(poses.rotations - state.estimate.rotations).max(axis=(1, 2)) > 0.02
+    if not is_flipped.any():
         return state
     estimate = replace(state.estimate, rotations=poses.rotations, translations=poses.translations)
     return problem.with_estimate(state, estimate)
@@ -218,13 +220,13 @@ def _with_better_twins(problem: CalibrationProblem, state: AdjustedNetwork) -> A
 def _without_misfits(
     problem: CalibrationProblem, state: AdjustedNetwork
 ) -> tuple[CalibrationProblem, AdjustedNetwork, tuple[str, ...]]:
-    """Leave out photographs most of whose discs do not lie like the field's."""
+    """Drop photographs in which fewer than `_MIN_SHARE` of the discs fit, the worst one first."""
     dropped: tuple[str, ...] = ()
     while True:
         count = len(problem.views)
         view = state.network.observations.view
         share = np.bincount(view, state.solution.is_used, count) / np.bincount(view)
-        if share.min() >= _LEAST_SHARE or count <= LEAST_VIEWS:
+        if share.min() >= _MIN_SHARE or count <= LEAST_VIEWS:
             return problem, state, dropped
         worst = int(share.argmin())
         dropped = (*dropped, problem.views[worst].photo)
@@ -232,11 +234,11 @@ def _without_misfits(
 
 
 def _result(chosen: _Chosen, dropped: tuple[str, ...]) -> CameraCalibration:
-    """Return the camera with its covariance and what it does not determine."""
+    """Return the camera with its covariance and its undetermined parameters."""
     problem, state = chosen.problem, chosen.state
     model = state.model
-    known = precision(state.network, state.solution)
-    cov = known.camera_cov
+    estimated = precision(state.network, state.solution)
+    cov = estimated.camera_cov
     by_unknown = model.to_calibration()
     share = np.array([CENTRE_DETERMINED if n in ("cx", "cy") else DETERMINED for n in model.names])
     weak = np.sqrt(cov.diagonal()) > share * state.network.cameras.sd[0]
@@ -252,25 +254,25 @@ def _result(chosen: _Chosen, dropped: tuple[str, ...]) -> CameraCalibration:
         dropped,
         state.network,
         state.solution,
-        known,
+        estimated,
         problem.eccentricity(state.camera, state.estimate, observed),
         chosen.points,
         rms_px(chosen.fixed.solution),
         problem.radius_scale(state),
         problem.radius_scales(state),
         tuple(names[weak].tolist()),
-        tangled(model.names, _with_focal_difference(model.names, cov), _INFLATION),
+        tangled(model.names, _with_focal_difference(model.names, cov), _MAX_INFLATION),
         chosen.is_turn_unclear,
     )
 
 
 def _with_focal_difference(names: Sequence[str], cov: FloatArray) -> FloatArray:
-    """Return the covariance with fy - fx instead of fy, if that is estimated.
+    """Return the covariance of the parameters with fy replaced by fy - fx, if fy is estimated.
 
-    Whatever changes both focal lengths leaves their difference as it is: they are correlated, and
-    yet told apart.
+    fx and fy are strongly correlated because most errors change both alike. That must not count as
+    tangled: their difference is well determined.
     """
-    by = np.eye(len(names))
+    difference = np.eye(len(names))
     if "fy" in names:
-        by[names.index("fy"), names.index("fx")] = -1.0
-    return np.asarray(by @ cov @ by.T)
+        difference[names.index("fy"), names.index("fx")] = -1.0
+    return np.asarray(difference @ cov @ difference.T)

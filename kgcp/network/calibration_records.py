@@ -1,4 +1,4 @@
-"""What a calibration is asked for, what it is made from, and what it returns."""
+"""Settings, input and result of a calibration."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from kgcp.targets.fields.points import AnyField
 
 
 class PointModel(StrEnum):
-    """What the adjustment may do to the field's own coordinates."""
+    """How the adjustment treats the field's coordinates."""
 
-    FIXED = "fixed"  # nothing
-    STIFF = "stiff"  # move them as far as `Field.flat_sd_m` says
-    FREE = "free"  # estimate them, up to shift, turn and scale
+    FIXED = "fixed"  # held as stated
+    STIFF = "stiff"  # estimated with the stated standard deviations
+    FREE = "free"  # estimated from the photographs, but for shift, rotation and scale
 
 
 class LensModel(StrEnum):
-    """Which terms of distortion are estimated."""
+    """Distortion terms that are estimated."""
 
-    AUTO = "auto"  # as many as are significant
+    AUTO = "auto"  # those that are significant
     RADIAL = "radial"
     BROWN = "brown"
     RATIONAL = "rational"
@@ -35,51 +35,52 @@ class LensModel(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class CalibrationSettings:
-    """What is estimated."""
+    """Choice of the unknowns."""
 
     points: PointModel = PointModel.STIFF
     lens: LensModel = LensModel.AUTO
-    # whether fx and fy are one; None: two where that is significant, with `LensModel.AUTO`
+    # whether fx = fy; None: `LensModel.AUTO` decides by significance, other models take them equal
     is_same_aspect: bool | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NamedView:
-    """The measured discs of one photograph, and which of the field's they are."""
+    """The measured and identified discs of one photograph."""
 
     photo: str
-    point: IndexArray  # (k,)
+    point: IndexArray  # (k,): index of each disc in the field
     vectors: FloatArray  # (k, 5): centroid and second moments, as kgcp.measurement.discs.MOMENTS
     covs: FloatArray  # (k, 5, 5)
-    # whether the field could lie there turned by half a turn, or by quarters: it looks the same
+    # whether the field looks the same here after half a turn or a quarter turn
     is_symmetric: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraCalibration:
-    """A camera, how well it is known, and everything that was adjusted with it."""
+    """A camera with its covariance and the adjustment that it comes from."""
 
     camera: Camera
     covariance: CalibrationCovariance
     field: AnyField  # with the diameters that were used
     settings: CalibrationSettings
     views: tuple[NamedView, ...]  # those that took part
-    dropped: tuple[str, ...]  # photographs that do not fit the field or the others
+    dropped: tuple[str, ...]  # photographs that fit neither the field nor the others
     network: Network
     solution: Solution
     precision: Precision
     eccentricity: Eccentricity  # of every disc, in the order of the observations
-    points_used: PointModel  # fixed where the field's own shape cannot be estimated
-    rms_fixed_px: float  # per point, with the field as it is meant to be
-    radius_scale: float  # seen over stated radii
-    radius_scales: FloatArray  # (v,): the same of each photograph
+    points_used: PointModel  # FIXED if the field's shape cannot be estimated
+    rms_fixed_px: float  # per point, with the field as stated
+    radius_scale: float  # measured over stated radii: median
+    radius_scales: FloatArray  # (v,): the same for each photograph
     undetermined: tuple[str, ...]  # camera parameters that these photographs do not determine
-    tangled: tuple[str, ...]  # camera parameters that cannot be told apart
-    is_turn_unclear: bool  # whether a symmetric field may be turned between photographs
+    tangled: tuple[str, ...]  # camera parameters that cannot be separated
+    # whether a symmetric field may have been turned between photographs without this being noticed
+    is_turn_unclear: bool
 
     @property
     def rms_px(self) -> float:
-        """Root mean square of the residuals per point, √mean(dx² + dy²) [px]."""
+        """RMS of the residuals per point, √mean(dx² + dy²) [px]."""
         return rms_px(self.solution)
 
     @property
@@ -93,17 +94,17 @@ class CameraCalibration:
 
     @property
     def operator_sd_px(self) -> float:
-        """Median of the discs' own deviations per point, as the operator states them [px]."""
+        """Median standard deviation per point that the disc operator states [px]."""
         return operator_sd_px(self.views)
 
 
 def operator_sd_px(views: Sequence[NamedView]) -> float:
-    """Return the median of the discs' deviations per point, as the operator states them [px]."""
+    """Return the median standard deviation per point that the disc operator states [px]."""
     covs = np.concatenate([view.covs[:, :2, :2] for view in views])
     return float(np.median(np.sqrt(np.trace(covs, axis1=1, axis2=2))))
 
 
 def rms_px(solution: Solution) -> float:
-    """Return √mean(dx² + dy²) of the discs that were kept [px]."""
+    """Return √mean(dx² + dy²) over the kept discs [px]."""
     squares = np.sum(solution.residuals[solution.is_used] ** 2, axis=1)
     return float(np.sqrt(squares.mean()))

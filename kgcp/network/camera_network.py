@@ -1,4 +1,4 @@
-"""One camera's network: what is observed, what is known beforehand, and its adjustment."""
+"""The network of one camera: observations, priors and adjustment."""
 
 from __future__ import annotations
 
@@ -41,30 +41,33 @@ from kgcp.network.records import (
 from kgcp.network.sheet_bends import bend_displacements, bend_shapes, first_bends, next_bends
 from kgcp.targets.fields.points import AnyField
 
-_CENTRE_SD = 0.1  # of the frame's longer side: how far a principal point may be from the middle
-CENTRE_DETERMINED = 0.1
-"""Largest standard deviation of a principal point that counts as determined, of the prior's: 1 % of
-the frame."""
-# How far from the middle a principal point may be found, of the frame's size. At 1 `Camera` ends,
-# and adjustments stick shortly before.
-_FARTHEST_CENTRE = 0.9
-_FOCAL_SD = 3.0  # of the focal length to start with
-_RADIAL_SD = 0.3  # of the distance from the middle, at the corner: what a term may displace
+# A-priori standard deviations: of the principal point about the middle, relative to the frame's
+# longer side; of the focal length, relative to its start value; of the displacement by one
+# distortion term at the frame's corner, relative to the corner's distance from the middle.
+_CENTRE_SD = 0.1
+_FOCAL_SD = 3.0
+_RADIAL_SD = 0.3
 _TANGENTIAL_SD = 0.05
-_SCALINGS = 10  # of the covariances, and new eccentricities, at most
-_HOLDINGS = 6  # of a principal point at the border of the frame, and releases
-_HELD_SD = 1e-3  # px
+CENTRE_DETERMINED = 0.1
+"""Largest standard deviation of a principal point that counts as determined, relative to the
+a-priori one. It is 1 % of the frame's longer side."""
+# Largest distance of a principal point from the middle, relative to the frame's size. `Camera`
+# allows less than 1, and adjustments get stuck shortly before that.
+_MAX_CENTRE_OFFSET = 0.9
+_MAX_ADJUSTMENTS = 10  # with updated covariances and eccentricities
+_MAX_HOLDINGS = 6  # rounds in which a principal point is held at the frame's border or released
+_HELD_SD_PX = 1e-3
 _SETTLED_PX = 0.002  # change of the eccentricities between two adjustments
 _SETTLED_VARIANCE = 1.25  # ratio of the discs' variances between two adjustments
-_POWER = {"k1": 2, "k2": 4, "k3": 6, "k4": 2, "k5": 4, "k6": 6}
+_RADIUS_POWER = {"k1": 2, "k2": 4, "k3": 6, "k4": 2, "k5": 4, "k6": 6}
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkUnknowns:
-    """What is estimated in an adjustment."""
+    """Unknowns of an adjustment."""
 
     points: PointModel
-    terms: tuple[str, ...]  # of the distortion
+    terms: tuple[str, ...]  # distortion terms
     is_same_aspect: bool
 
     @property
@@ -75,7 +78,7 @@ class NetworkUnknowns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdjustedNetwork:
-    """An adjusted network, and what was estimated in it."""
+    """An adjusted network with its unknowns."""
 
     camera: Camera
     estimate: Estimate
@@ -85,7 +88,7 @@ class AdjustedNetwork:
 
     @property
     def model(self) -> FrameCameraModel:
-        """The camera with these unknowns."""
+        """The camera model with these unknowns."""
         terms, is_same_aspect = self.unknowns.terms, self.unknowns.is_same_aspect
         return FrameCameraModel(_without(self.camera, terms), terms, is_same_aspect)
 
@@ -119,9 +122,13 @@ class CalibrationProblem:
         )
 
     def with_unknowns(self, state: AdjustedNetwork, unknowns: NetworkUnknowns) -> AdjustedNetwork:
-        """Return the adjustment of other unknowns; bends are those of the state, estimated anew."""
+        """Return the adjustment of other unknowns, starting from a state.
+
+        If the field bends in the state, it bends in the result as well; the bends are estimated
+        anew.
+        """
         cov, bends = state.network.observations.cov, state.network.bends
-        # as in `adjusted`: by the discs' own covariances, terms of rational models would run away
+        # stated covariances let the terms of rational models diverge: see `adjusted`
         keeps_cov = bends is not None or unknowns.is_rational
         if not keeps_cov or state.unknowns.points is not unknowns.points:
             return self.adjusted(state.camera, state.estimate, unknowns)
@@ -134,21 +141,23 @@ class CalibrationProblem:
     def adjusted(
         self, camera: Camera, estimate: Estimate, unknowns: NetworkUnknowns
     ) -> AdjustedNetwork:
-        """Return the adjustment once the eccentricities have settled.
+        """Return the adjustment without bends, iterated until the eccentricities have settled.
 
-        The covariances of the discs are made to fit their residuals, so that priors, which are
-        absolute, get the weight that they deserve.
+        The covariances of the discs are fitted to their residuals. Priors are absolute, and only
+        realistic covariances of the discs give them their proper weight.
         """
-        start, cov = estimate.unbent(0), self.observations().cov
-        # Errors of a field that stays as stated would outweigh priors from the beginning, and terms
-        # that can hardly be told apart grow to poles of the rational model between the discs. Those
-        # of a field that may move are no noise: it would hardly leave its place.
+        start, cov = estimate.with_zero_bends(0), self.observations().cov
+        # If the field is fixed, its errors inflate the residuals. With the stated covariances the
+        # discs would outweigh the priors in the first adjustment. Rational terms, which are hard
+        # to separate, would then grow until the model has poles between the discs. Therefore the
+        # covariances are fitted before. If the field may move, its errors are no noise: with such
+        # covariances it would hardly leave its stated place.
         if unknowns.is_rational and unknowns.points is PointModel.FIXED:
             cov = self._fitting_at(camera, start)
         return self._settled(camera, start, unknowns, cov, None)
 
     def _fitting_at(self, camera: Camera, estimate: Estimate) -> FloatArray:
-        """Return covariances (n, 2, 2) of the discs that agree with an estimate to start from."""
+        """Return covariances (n, 2, 2) of the discs that agree with the residuals of a start."""
         observed = self.observations()
         circles = observed_circles(self.field, estimate, observed)
         squares = np.sum((observed.places - camera.project(circles.centres_m)) ** 2, axis=1)
@@ -157,14 +166,15 @@ class CalibrationProblem:
     def bent(self, state: AdjustedNetwork) -> AdjustedNetwork:
         """Return the adjustment of a free field that bends, or `state` if it hardly does.
 
-        Bends that displace discs by less than these are measured to may be errors of the operator.
-        With them, the focal length of DICe's rendered boards, which cannot bend, went from -0.8 to
-        -1.4 px off.
+        Bends count only if they displace the discs by more than the standard deviation of their
+        measurement. Smaller ones may be errors of the disc operator. DICe's rendered boards cannot
+        bend; when bends were estimated for them, the error of the focal length grew from -0.8 to
+        -1.4 px.
 
         Parameters
         ----------
         state : AdjustedNetwork
-            Without bends.
+            The adjustment without bends.
         """
         if state.unknowns.points is not PointModel.FREE or not self.field.starts_from_homographies:
             return state
@@ -174,11 +184,11 @@ class CalibrationProblem:
         bends = first_bends(fitting, solution, bend_shapes(self.field.points_m()))
         if bends is None:
             return state
-        start = state.estimate.unbent(bends.shapes.shape[1])
+        start = state.estimate.with_zero_bends(bends.shapes.shape[1])
         bent = self._settled(state.camera, start, state.unknowns, cov, bends)
         squares = np.sum(bend_displacements(bent.network, bent.estimate) ** 2, axis=1)
-        is_seen = np.sqrt(squares[bent.solution.is_used].mean()) > operator_sd_px(self.views)
-        return bent if is_seen else state
+        is_noticeable = np.sqrt(squares[bent.solution.is_used].mean()) > operator_sd_px(self.views)
+        return bent if is_noticeable else state
 
     def _settled(
         self,
@@ -188,14 +198,22 @@ class CalibrationProblem:
         cov: FloatArray,
         bends: BendPrior | None,
     ) -> AdjustedNetwork:
-        """Return the adjustment that starts with some covariances (n, 2, 2) and bends."""
+        """Repeat the adjustment until eccentricities, covariances and bends have settled.
+
+        Parameters
+        ----------
+        cov : (n, 2, 2) array
+            Covariances of the discs to start with.
+        bends : BendPrior or None
+            Bends to start with; None: the field does not bend.
+        """
         observed = self.observations()
         if unknowns.is_same_aspect:
             camera = replace(camera, fy=camera.fx)
         terms = unknowns.terms
         model = FrameCameraModel(_without(camera, terms), terms, unknowns.is_same_aspect)
         before = np.full_like(observed.places, np.inf)
-        for _ in range(_SCALINGS):
+        for _ in range(_MAX_ADJUSTMENTS):
             offsets = self.eccentricity(camera, estimate, observed).total_px
             offsets = np.where(np.isfinite(offsets), offsets, 0.0)
             network = Network(
@@ -225,47 +243,49 @@ class CalibrationProblem:
         return AdjustedNetwork(camera, estimate, unknowns, network, solution)
 
     def _with_kept_centre(self, network: Network, start: Estimate) -> Solution:
-        """Return the adjustment, with a principal point that is lost held at the frame's border.
+        """Return the adjustment; a principal point that runs away is held at the frame's border.
 
-        That of cropped photographs may well be outside. But if it is hardly determined, a field
-        that is not as described can draw it out to where no camera exists. Then it is held, as
-        long as the photographs draw it outwards.
+        In cropped photographs the principal point may well lie outside the frame. But if it is
+        hardly determined, a wrong description of the field can move it so far that no valid camera
+        exists. Then it is held at the border as long as the photographs pull it outwards.
         """
         names = network.model.names
         index, last_px = _centre_of(names), np.array(self.size) - 1.0
         is_held, held_px = np.zeros(2, dtype=np.bool_), np.zeros(2)
-        for _ in range(_HOLDINGS):
+        for _ in range(_MAX_HOLDINGS):
             solution = adjust_network(
                 _held_at(network, index[is_held], held_px[is_held]), start, ROBUST
             )
             start = solution.estimate
             centre_px = start.cameras[0, index]
             nearest_px = np.clip(centre_px, 0.0, last_px)
-            # a coordinate that is held has given way a little to where the photographs draw it
+            # a held coordinate gives way a little: this tells where the photographs pull it
             is_outward = (centre_px - held_px) * (held_px - 0.5 * last_px) > 0.0
-            is_lost = centre_px != nearest_px
-            if np.any(is_lost & ~is_held):
-                is_lost &= self._is_lost(network, solution, index)
+            is_runaway = centre_px != nearest_px
+            if np.any(is_runaway & ~is_held):
+                is_runaway &= self._is_undetermined(network, solution, index)
             held_px = np.where(is_held, held_px, nearest_px)
-            was_held, is_held = is_held, np.where(is_held, is_outward, is_lost)
+            was_held, is_held = is_held, np.where(is_held, is_outward, is_runaway)
             if np.array_equal(was_held, is_held):
                 break
         cameras = start.cameras.copy()
         cameras[0, index[was_held]] = held_px[was_held]
         return replace(solution, estimate=replace(start, cameras=cameras))
 
-    def _is_lost(self, network: Network, solution: Solution, index: IndexArray) -> BoolArray:
+    def _is_undetermined(
+        self, network: Network, solution: Solution, index: IndexArray
+    ) -> BoolArray:
         """Return which coordinates of the principal point are hardly determined.
 
-        So are those at the end of what a `Camera` may have: the minimum is beyond.
+        They include those at the limit of what `Camera` allows: their minimum lies beyond it.
         """
         sd = np.sqrt(precision(network, solution).camera_cov.diagonal()[index])
-        from_middle = np.abs(solution.estimate.cameras[0, index] / self.size - 0.5)
-        is_loose = sd > CENTRE_DETERMINED * network.cameras.sd[0, index]
-        return np.asarray(is_loose | (from_middle > _FARTHEST_CENTRE))
+        offset = np.abs(solution.estimate.cameras[0, index] / self.size - 0.5)
+        is_weak = sd > CENTRE_DETERMINED * network.cameras.sd[0, index]
+        return np.asarray(is_weak | (offset > _MAX_CENTRE_OFFSET))
 
     def is_at_border(self, names: Sequence[str], estimate: Estimate) -> BoolArray:
-        """Return which unknowns (p,) are a principal point's that is held at the border."""
+        """Return which unknowns (p,) are coordinates of a principal point held at the border."""
         is_held = np.zeros(len(names), dtype=np.bool_)
         index, border = _centre_of(names), np.array(self.size) - 1.0
         centre = estimate.cameras[0, index]
@@ -275,11 +295,11 @@ class CalibrationProblem:
     def eccentricity(
         self, camera: Camera, estimate: Estimate, observed: Observations
     ) -> Eccentricity:
-        """Return how far the centroids of all discs are from the images of their centres."""
+        """Return the offsets of all discs' centroids from the images of their centres."""
         return eccentricity(camera, observed_circles(self.field, estimate, observed))
 
     def point_prior(self, points: PointModel) -> PointPrior:
-        """Return what the adjustment knows of the field; unseen points stay where they are."""
+        """Return the prior of the field's points; unobserved points stay at their stated places."""
         nominal = self.field.points_m()
         if points is PointModel.FIXED:
             return PointPrior(nominal, None)
@@ -290,36 +310,37 @@ class CalibrationProblem:
         )
         sds = self.field.point_sds_m()
         if points is PointModel.FREE:
-            # a tenth of the pitch limits what the photographs hardly determine
+            # a weak prior of a tenth of the pitch: for what the photographs hardly determine
             sds = np.full_like(sds, 0.1 * self.field.pitch_m)
         return PointPrior(nominal, np.eye(3) * sds[:, None] ** -2.0, bars)
 
     def camera_prior(self, model: FrameCameraModel, camera: Camera) -> CalibrationPrior:
-        """Return what is known of any camera: a principal point in the middle, small distortion."""
+        """Return the prior of any camera: a central principal point and small distortion."""
         width, height = self.size
         corner = 0.5 * math.hypot(width, height) / camera.mean_focal_px
-        usual = {"cx": 0.5 * (width - 1), "cy": 0.5 * (height - 1)}
+        middle = {"cx": 0.5 * (width - 1), "cy": 0.5 * (height - 1)}
         values, sd = [], []
         for name in model.names:
-            values.append(usual.get(name, getattr(camera, name) if name[0] == "f" else 0.0))
+            values.append(middle.get(name, getattr(camera, name) if name[0] == "f" else 0.0))
             sd.append(self._sd(name, camera, corner))
         return CalibrationPrior(np.array([values]), np.array([sd]))
 
     def _sd(self, name: str, camera: Camera, corner: float) -> float:
+        """Return an a-priori standard deviation; `corner` is the corner's normalised radius."""
         if name in ("fx", "fy"):
             return _FOCAL_SD * camera.mean_focal_px
         if name in ("cx", "cy"):
             return _CENTRE_SD * max(self.size)
         if name in ("p1", "p2"):
             return _TANGENTIAL_SD / corner
-        return _RADIAL_SD / corner ** _POWER[name]
+        return _RADIAL_SD / corner ** _RADIUS_POWER[name]
 
     def radius_scale(self, state: AdjustedNetwork) -> float:
-        """Return the median of measured over expected radii, the latter through the lens."""
+        """Return the median ratio of measured to expected radii; those include distortion."""
         return float(np.nanmedian(self._radius_ratios(state)))
 
     def radius_scales(self, state: AdjustedNetwork) -> FloatArray:
-        """Return the same of every photograph (v,); NaN if none of its discs is used."""
+        """Return `radius_scale` of each photograph (v,); NaN if none of its discs is used."""
         ratios, view = self._radius_ratios(state), state.network.observations.view
         used = np.isfinite(ratios)
         return np.array(
@@ -330,7 +351,7 @@ class CalibrationProblem:
         )
 
     def _radius_ratios(self, state: AdjustedNetwork) -> FloatArray:
-        """Return measured over expected radii (n,); NaN of discs that are not used."""
+        """Return the ratios (n,) of measured to expected radii; NaN for discs that are not used."""
         observed = self.observations()
         expected = circle_images(
             state.camera, observed_circles(self.field, state.estimate, observed)
@@ -357,9 +378,9 @@ def _centre_of(names: Sequence[str]) -> IndexArray:
 
 def _held_at(network: Network, index: IndexArray, values: FloatArray) -> Network:
     """Return the network with some of the camera's parameters (k,) held at values."""
-    known, sd = network.cameras.values.copy(), network.cameras.sd.copy()
-    known[0, index], sd[0, index] = values, _HELD_SD
-    return replace(network, cameras=CalibrationPrior(known, sd))
+    prior, sd = network.cameras.values.copy(), network.cameras.sd.copy()
+    prior[0, index], sd[0, index] = values, _HELD_SD_PX
+    return replace(network, cameras=CalibrationPrior(prior, sd))
 
 
 def _determinant(moments: FloatArray) -> FloatArray:
@@ -367,7 +388,7 @@ def _determinant(moments: FloatArray) -> FloatArray:
 
 
 def _without(camera: Camera, terms: Sequence[str]) -> Camera:
-    """Return a camera whose other terms of distortion are zero."""
-    absent = [name for name in (*_POWER, "p1", "p2") if name not in terms]
+    """Return a camera with all distortion terms but these set to zero."""
+    absent = [name for name in (*_RADIUS_POWER, "p1", "p2") if name not in terms]
     zeros: dict[str, Any] = dict.fromkeys(absent, 0.0)
     return replace(camera, **zeros)

@@ -1,23 +1,30 @@
-"""Formal and clustered covariances of a network, and which parameters it cannot tell apart.
+"""Formal and clustered covariances of a network, and which parameters it cannot separate.
 
-The formal covariance s₀² N⁻¹ assumes that all discs are independent. They are not: whatever
-distorts a photograph (a shutter, the light, a model that does not fit) displaces all its discs.
-Halves of the same sets of photographs differ by 2 to 7 formal standard deviations. The covariance
-is therefore estimated from the scatter between photographs, those of one place together, whose
-residuals are divided by a power of their redundancy. CR2 of Bell & McCaffrey (2002), with the power
-1/2, still assumes that the discs of a photograph are independent; halves differ by 1.0 to 2.1 of
-its standard deviations. CR3, with the power 1, is the jackknife; with three to five photographs,
-one of which dominates, halves differ by 0.3 to 0.5 of its standard deviations. The power used here
-is between the two.
+The formal covariance s₀² N⁻¹ assumes that the errors of all discs are independent. They are not: a
+shutter, the light or a wrong model displaces all discs of a photograph. The test is to calibrate
+from two halves of a set of photographs, and to compare their difference with its standard
+deviation; the ratio should be 1. With formal standard deviations it is 2 to 7.
 
-With independent errors, too, residuals over a power of their redundancy scatter more than the
-parameters do, by an amount that is known, and few photographs scatter more or less by chance. So
-only what they scatter in excess of independent errors, less what chance makes of none (James &
-Stein), is added to the formal covariance. Halves of photographs with independent errors, from where
-three published sets were taken, then differ by 0.82 (boof_regular), 0.88 (ros10) and 0.96
-(dice_white) of their standard deviations; by the scatter itself, raised to the formal covariance
-where it is smaller, by 0.72, 0.79 and 0.66. Halves of six sets themselves differ by 0.81
-(dice_white) to 1.26 (ros10); by the scatter itself by 0.71 to 1.34.
+Therefore the covariance is estimated from the scatter between places, each with all its
+photographs. Residuals are first divided by a power of their redundancy:
+
+- Power 1/2 is CR2 of Bell & McCaffrey (2002), which still assumes that the discs of a photograph
+  are independent. The ratio is 1.0 to 2.1.
+- Power 1 is CR3, the jackknife. The ratio is 0.3 to 0.5 with three to five photographs, one of
+  which dominates.
+
+The power used here, `_REDUNDANCY_POWER`, lies between the two.
+
+Two corrections follow. Even with independent errors, the residuals so divided scatter more than the
+parameters, by a known amount. And with few photographs, their scatter varies by chance. So only the
+scatter in excess of independent errors is added to the formal covariance, shrunk by the amount that
+chance explains (James & Stein). The alternative is to use the scatter itself, but never less than
+the formal covariance. The ratios are then:
+
+- Simulated photographs with independent errors, with the geometry of three published sets: 0.82
+  (boof_regular), 0.88 (ros10) and 0.96 (dice_white); by the scatter itself 0.72, 0.79 and 0.66.
+- Six published sets themselves: 0.81 (dice_white) to 1.26 (ros10); by the scatter itself 0.71 to
+  1.34.
 """
 
 from __future__ import annotations
@@ -49,9 +56,12 @@ from kgcp.network.point_elimination import (
 )
 from kgcp.network.records import Network, Precision, Solution
 
-_POWER = 0.75
-_LEAST_FACTOR = 1e-4  # of the stated variances: residuals of zero prove nothing
-_LEAST_REDUNDANCY = 1e-6  # of a direction of the observations: below, nothing else checks it
+_REDUNDANCY_POWER = 0.75
+# Smallest factor of the stated variances. Residuals of zero do not prove that the discs are exact.
+_MIN_FACTOR = 1e-4
+# Smallest redundancy of a direction in the space of the observations. Below, no other observation
+# checks it, and its residual says nothing.
+_MIN_REDUNDANCY = 1e-6
 
 
 def precision(network: Network, solution: Solution) -> Precision:
@@ -82,14 +92,14 @@ def precision(network: Network, solution: Solution) -> Precision:
 def fitting_covariances(network: Network, solution: Solution, stated: FloatArray) -> FloatArray:
     """Return covariances (n, 2, 2) of the discs that agree with their residuals.
 
-    If the residuals are smaller than `stated`, all covariances are scaled. If they are larger, the
-    same variance is added to all discs: an effect that the model lacks does not depend on how well
-    a disc was measured.
+    If the residuals are smaller than stated, all covariances are scaled. If they are larger, the
+    same variance is added to all discs, because model errors do not depend on how well a disc was
+    measured.
 
     Parameters
     ----------
     stated : (n, 2, 2) array
-        Covariances as the discs were measured.
+        Covariances that the disc operator states.
     """
     freedom = _observation_freedom(network, solution)
     values, vectors = np.linalg.eigh(stated)
@@ -97,7 +107,7 @@ def fitting_covariances(network: Network, solution: Solution, stated: FloatArray
     squares = along**2 * solution.weights[:, None]
     factor = float(np.sum(squares / values)) / freedom
     if factor <= 1.0:
-        return np.asarray(max(factor, _LEAST_FACTOR) * stated)
+        return np.asarray(max(factor, _MIN_FACTOR) * stated)
 
     def excess(added: float) -> float:
         return float(np.sum(squares / (values + added))) - freedom
@@ -107,7 +117,7 @@ def fitting_covariances(network: Network, solution: Solution, stated: FloatArray
 
 
 def bend_cofactors(network: Network, solution: Solution) -> FloatArray:
-    """Return the cofactors (v, b) of the photographs' bends, all else unknown as well."""
+    """Return the cofactors (v, b) of the bends, with all other unknowns estimated as well."""
     equations = view_rows(network, solution.estimate, solution.weights)
     if can_eliminate_points(network):
         reduced = reduce_points(network, solution.estimate, equations)
@@ -117,13 +127,16 @@ def bend_cofactors(network: Network, solution: Solution) -> FloatArray:
 
 
 def _observation_freedom(network: Network, solution: Solution) -> float:
-    """Return how many observations there are beyond those that determine the unknowns."""
+    """Return the redundancy of the observations: their number minus that of unknowns.
+
+    Unknowns count only by the share that the observations, not the priors, determine.
+    """
     used = 2 * int(np.count_nonzero(solution.weights))
-    taken = _unknowns(network) - _determined_by_priors(network, solution)
-    return max(used - taken - 6 * len(network.view_camera), 1.0)
+    by_observations = _unknown_count(network) - _determined_by_priors(network, solution)
+    return max(used - by_observations - 6 * len(network.view_camera), 1.0)
 
 
-def _unknowns(network: Network) -> int:
+def _unknown_count(network: Network) -> int:
     """Return the number of unknowns besides the poses."""
     points = 0 if network.points.is_fixed else network.points.nominal.size
     bends = network.bend_count * len(network.view_camera)
@@ -131,7 +144,7 @@ def _unknowns(network: Network) -> int:
 
 
 def _determined_by_priors(network: Network, solution: Solution) -> float:
-    """Return the number of unknowns that priors and inner constraints determine, in shares."""
+    """Return how many unknowns priors and inner constraints determine, as a sum of shares."""
     equations = view_rows(network, solution.estimate, solution.weights)
     if can_eliminate_points(network):
         return determined_by_priors(network, reduce_points(network, solution.estimate, equations))
@@ -146,7 +159,7 @@ def _determined_by_priors(network: Network, solution: Solution) -> float:
 
 
 def _degrees_of_freedom(network: Network, weights: FloatArray, unknowns: int) -> int:
-    """Return observations plus priors minus unknowns."""
+    """Return the number of observations and priors minus that of unknowns."""
     used = 2 * int(np.count_nonzero(weights))
     priors = int(np.count_nonzero(np.isfinite(network.cameras.sd))) + len(network.points.bars)
     if network.points.information is not None:
@@ -172,7 +185,7 @@ def _inverse(network: Network, system: ReducedSystem) -> FloatArray:
 
 
 def _pose_inverses(system: ReducedSystem, inverse: FloatArray) -> FloatArray:
-    """Return the cofactors (v, q, q) of poses and bends, cameras and points unknown as well."""
+    """Return the cofactors (v, q, q) of poses and bends, with cameras and points estimated."""
     cofactors = []
     for normal, coupling, columns in zip(
         system.pose_normals, system.couplings, system.columns, strict=True
@@ -191,7 +204,7 @@ def _bend_cofactors(system: ReducedSystem, inverse: FloatArray) -> FloatArray:
 def _redundancy_numbers(
     equations: Sequence[ViewRows], system: ReducedSystem, inverse: FloatArray, count: int
 ) -> FloatArray:
-    """Return the share (n,) of each disc's two coordinates that checks the others, 0…2."""
+    """Return the redundancy numbers (n,) of the discs, summed over both coordinates: 0…2."""
     redundancy = np.zeros(count)
     for view, normal in zip(equations, system.pose_normals, strict=True):
         projected, _ = _without_pose(view)
@@ -204,7 +217,7 @@ def _redundancy_numbers(
 
 
 def _by_place(equations: Sequence[ViewRows], places: IndexArray) -> list[list[ViewRows]]:
-    """Return the equations of each place's photographs."""
+    """Return the equations of the photographs, grouped by place."""
     groups: list[list[ViewRows]] = [[] for _ in range(int(places.max()) + 1)]
     for view, place in zip(equations, places.tolist(), strict=True):
         groups[place].append(view)
@@ -214,37 +227,37 @@ def _by_place(equations: Sequence[ViewRows], places: IndexArray) -> list[list[Vi
 def _camera_covariance(
     network: Network, places: Sequence[Sequence[ViewRows]], inverse: FloatArray, factor: float
 ) -> FloatArray:
-    """Return the covariance (c p, c p) of the camera parameters: formal, plus what places show.
+    """Return the covariance (c p, c p) of the camera parameters: formal plus excess scatter.
 
-    What priors contribute is part of the formal one, and does not scatter between places.
+    Priors contribute to the formal covariance, but not to the scatter between places.
     """
     cameras = network.cameras.values.size
     formal = factor * inverse[:cameras, :cameras]
     scale = np.sqrt(formal.diagonal())
     root = np.linalg.cholesky(formal / np.outer(scale, scale)) * scale[:, None]
-    in_formal = np.linalg.solve(root, inverse[:cameras])
-    pulls = [_pull(*_together(views), in_formal, inverse, factor) for views in places]
-    excess = beyond_independent(
+    from_scores = np.linalg.solve(root, inverse[:cameras])
+    pulls = [_pull(*_joined(views), from_scores, inverse, factor) for views in places]
+    excess = excess_scatter(
         np.array([pull for pull, _ in pulls]), np.array([expected for _, expected in pulls])
     )
     result = root @ (np.eye(cameras) + excess) @ root.T
     return np.asarray(0.5 * (result + result.T))
 
 
-def beyond_independent(pulls: FloatArray, expected: FloatArray) -> FloatArray:
-    """Return how much more (c, c) the pulls of places scatter than independent errors make them.
+def excess_scatter(pulls: FloatArray, expected: FloatArray) -> FloatArray:
+    """Return the scatter (c, c) of the places' pulls beyond that of independent errors.
 
-    The scatter and what it is expected to be differ by a matrix whose squared norm chance makes
-    about Σ tr(E)² + tr(E²) of places with expected scatters E. The difference counts by as much as
-    its own squared norm exceeds that: large ones stay as they are (James & Stein). Directions in
-    which places scatter less count as nothing.
+    The scatter minus its expectation is a matrix. By chance alone its squared norm would be about
+    Σ tr(E)² + tr(E²), the sum being over places with expected scatter E. The matrix is multiplied
+    by 1 minus the ratio of this value to its actual squared norm (James & Stein), so that a large
+    excess is hardly reduced. Directions in which places scatter less than expected count as zero.
 
     Parameters
     ----------
     pulls : (m, c) array
-        By how much each place pulls at the camera parameters, in units of their formal deviations.
+        Shift of the camera parameters by each place, in units of their formal standard deviations.
     expected : (m, c, c) array
-        Covariances that independent errors give the pulls.
+        Covariances of the pulls if errors are independent.
     """
     excess = pulls.T @ pulls - expected.sum(axis=0)
     by_chance = np.sum(np.trace(expected, axis1=1, axis2=2) ** 2) + np.sum(expected**2)
@@ -253,20 +266,20 @@ def beyond_independent(pulls: FloatArray, expected: FloatArray) -> FloatArray:
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
-def _together(views: Sequence[ViewRows]) -> tuple[FloatArray, FloatArray, IndexArray]:
-    """Return the equations of a place: derivatives (n, k), residuals (n,), columns (k,).
+def _joined(views: Sequence[ViewRows]) -> tuple[FloatArray, FloatArray, IndexArray]:
+    """Return the equations of one place: derivatives (n, k), residuals (n,), columns (k,).
 
-    Poses are eliminated, and n is the number of rows of all photographs.
+    Poses are eliminated; n is the number of rows of all its photographs.
     """
     parts = [_without_pose(view) for view in views]
     residuals = np.concatenate([part for _, part in parts])
     columns = dict.fromkeys(np.concatenate([view.columns for view in views]).tolist())
-    index = {column: at for at, column in enumerate(columns)}
+    index = {column: number for number, column in enumerate(columns)}
     projected = np.zeros((len(residuals), len(columns)))
     first = 0
-    for view, (own, _) in zip(views, parts, strict=True):
-        last = first + len(own)
-        projected[first:last, [index[column] for column in view.columns.tolist()]] = own
+    for view, (rows, _) in zip(views, parts, strict=True):
+        last = first + len(rows)
+        projected[first:last, [index[column] for column in view.columns.tolist()]] = rows
         first = last
     return projected, residuals, np.array(list(columns))
 
@@ -275,18 +288,22 @@ def _pull(
     projected: FloatArray,
     residuals: FloatArray,
     columns: IndexArray,
-    in_formal: FloatArray,
+    from_scores: FloatArray,
     inverse: FloatArray,
     factor: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return a place's C Aᵀ (I - H)^-p r (c,) with the power p, and its expected covariance.
+    """Return a place's pull at the camera parameters (c,) and its expected covariance (c, c).
 
-    C (c, u) makes steps of the camera of scores. Independent residuals have the covariance s₀² (I -
-    H), so that of the result is s₀² C Aᵀ (I - H)^(1 - 2p) A Cᵀ. By the eigenvalues of H, in
-    whichever space is smaller: that of the observations, or that of the unknowns, where H is
-    LᵀAᵀA L with the Cholesky factor L of the cofactors.
+    The pull is C Aᵀ (I - H)^-p r, with the derivatives A, the residuals r and the leverage H of the
+    place, and the power p. C (c, u) turns scores Aᵀ r into steps of the camera parameters.
+    Independent errors give residuals the covariance s₀² (I - H), and the pull the covariance
+    s₀² C Aᵀ (I - H)^(1 - 2p) A Cᵀ.
+
+    Powers are computed from the eigenvalues of H, in the smaller of two spaces: that of the
+    observations, or that of the unknowns, where H is LᵀAᵀA L with the Cholesky factor L of the
+    cofactors.
     """
-    carried, shared = in_formal[:, columns], inverse[np.ix_(columns, columns)]
+    carried, shared = from_scores[:, columns], inverse[np.ix_(columns, columns)]
     if len(shared) < len(residuals):
         root = np.linalg.cholesky(shared)
         values, vectors = np.linalg.eigh(root.T @ (projected.T @ projected) @ root)
@@ -296,16 +313,19 @@ def _pull(
         values, vectors = np.linalg.eigh(projected @ shared @ projected.T)
         along = vectors.T @ residuals
         carried, squares = carried @ projected.T @ vectors, np.ones_like(values)
-    is_checked = 1.0 - values > _LEAST_REDUNDANCY  # what nothing else checks says nothing
+    is_checked = 1.0 - values > _MIN_REDUNDANCY
     carried, redundancy = carried[:, is_checked], 1.0 - values[is_checked]
-    expected = factor * squares[is_checked] * redundancy ** (1.0 - 2.0 * _POWER)
-    return carried @ (along[is_checked] / redundancy**_POWER), (carried * expected) @ carried.T
+    expected = factor * squares[is_checked] * redundancy ** (1.0 - 2.0 * _REDUNDANCY_POWER)
+    return (
+        carried @ (along[is_checked] / redundancy**_REDUNDANCY_POWER),
+        (carried * expected) @ carried.T,
+    )
 
 
 def _without_pose(view: ViewRows) -> tuple[FloatArray, FloatArray]:
-    """Return derivatives (2m + b, k) and residuals without the part that the pose takes up.
+    """Return derivatives (2m + b, k) and residuals (2m + b,) with pose and bends eliminated.
 
-    The last rows are those of the bends' prior.
+    The last b rows are those of the bends' prior.
     """
     basis = np.linalg.qr(np.vstack((view.by_pose, view.bend_rows)))[0]
     dense, residuals = view.dense(), np.concatenate((view.residuals, view.bend_residuals))
@@ -313,16 +333,16 @@ def _without_pose(view: ViewRows) -> tuple[FloatArray, FloatArray]:
     return dense - basis @ (basis.T @ dense), residuals - basis @ (basis.T @ residuals)
 
 
-def tangled(names: Sequence[str], cov: FloatArray, most_inflation: float) -> tuple[str, ...]:
-    """Return the parameters that cannot be told apart, empty if all can.
+def tangled(names: Sequence[str], cov: FloatArray, max_inflation: float) -> tuple[str, ...]:
+    """Return the parameters that cannot be separated; empty if all can.
 
-    They are those of the weakest eigenvector of the correlation matrix, if the other parameters
-    inflate the variance of one of them by more than `most_inflation`.
+    There are some if correlation inflates the variance of a parameter by more than `max_inflation`.
+    They are those that dominate the eigenvector of the correlation matrix's smallest eigenvalue.
     """
     sd = np.sqrt(cov.diagonal())
     correlation = cov / np.outer(sd, sd)
     inflation = np.linalg.inv(correlation).diagonal()
-    if inflation.max() <= most_inflation:
+    if inflation.max() <= max_inflation:
         return ()
     _, vectors = np.linalg.eigh(correlation)
     weakest = np.abs(vectors[:, 0])

@@ -9,25 +9,27 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.network.records import Estimate, ImageSlopes, Network, PointPrior, ScaleBar
 
-_LEAST_DEPTH = 1e-9  # of the distance: a point in the camera's own plane has no image
+# Smallest depth of a point, relative to its distance. A point in the plane through the projection
+# centre parallel to the image has no image.
+_MIN_DEPTH = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewRows:
-    """Whitened equations of one photograph, of m discs.
+    """Whitened observation equations of one photograph with m discs.
 
-    Rows are in units of the standard deviation of their observation: x and y of a disc, after the
-    inverse Cholesky factor of its covariance and the root of its weight.
+    x and y of each disc are multiplied by the inverse Cholesky factor of its covariance and by the
+    root of its weight, so that rows are in units of their standard deviation.
     """
 
-    rows: IndexArray  # (m,): which observations
-    columns: IndexArray  # (k,): of the reduced unknowns that take part: camera, then points
-    by_pose: FloatArray  # (2m, q): by the pose, then by the bends
+    rows: IndexArray  # (m,): indices of the observations
+    columns: IndexArray  # (k,): indices among the reduced unknowns: camera, then points
+    by_pose: FloatArray  # (2m, q): derivatives by the pose, then by the bends
     by_camera: FloatArray  # (2m, p)
     by_point: FloatArray | None  # (m, 2, 3): each disc by its own point; None: points are fixed
     residuals: FloatArray  # (2m,)
-    # as further rows, in units of their standard deviation: that the field is not bent
-    bend_rows: FloatArray  # (b, q): by pose and bends
+    # the bends' prior as further whitened rows: every bend is zero
+    bend_rows: FloatArray  # (b, q): derivatives by pose and bends
     bend_residuals: FloatArray  # (b,)
 
     @property
@@ -53,7 +55,7 @@ class ViewRows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReducedSystem:
-    """Normal equations after the poses are eliminated, and what brings the poses back."""
+    """Normal equations with the poses eliminated, and the terms to compute the poses from them."""
 
     normal: FloatArray  # (u, u)
     right: FloatArray  # (u,)
@@ -64,34 +66,37 @@ class ReducedSystem:
 
 
 def computed(network: Network, estimate: Estimate) -> FloatArray:
-    """Return where the discs must be (n, 2) by the current values of all unknowns."""
-    seen = network.observations
+    """Return the computed places (n, 2) of the discs for the current values of all unknowns."""
+    observed = network.observations
     rays = _camera_points(network, estimate)
     normalised = rays[:, :2] / rays[:, 2:]
-    places = np.empty_like(seen.places)
-    cameras = network.view_camera[seen.view]
+    places = np.empty_like(observed.places)
+    cameras = network.view_camera[observed.view]
     for camera in range(len(estimate.cameras)):
-        mine = cameras == camera
-        places[mine] = network.model.places(estimate.cameras[camera], normalised[mine])
+        in_camera = cameras == camera
+        places[in_camera] = network.model.places(estimate.cameras[camera], normalised[in_camera])
     return places
 
 
 def bent_points(network: Network, estimate: Estimate) -> FloatArray:
-    """Return where each observed point was in its photograph (n, 3), in the field's frame."""
-    seen = network.observations
-    points = np.asarray(estimate.points[seen.point])
+    """Return the observed points (n, 3) on the field as bent in their photographs, field frame."""
+    observed = network.observations
+    points = np.asarray(estimate.points[observed.point])
     if network.bends is not None:
-        shapes = network.bends.shapes[seen.point]
-        points[:, 2] += np.sum(shapes * estimate.bends[seen.view], axis=1)
+        shapes = network.bends.shapes[observed.point]
+        points[:, 2] += np.sum(shapes * estimate.bends[observed.view], axis=1)
     return points
 
 
 def _camera_points(network: Network, estimate: Estimate) -> FloatArray:
-    seen = network.observations
-    turned = np.einsum("nij,nj->ni", estimate.rotations[seen.view], bent_points(network, estimate))
-    points: FloatArray = turned + estimate.translations[seen.view]
-    flat = np.abs(points[:, 2]) < _LEAST_DEPTH * np.linalg.norm(points, axis=1)
-    points[flat, 2] = _LEAST_DEPTH
+    """Return the observed points (n, 3) in the frames of their cameras."""
+    observed = network.observations
+    rotated = np.einsum(
+        "nij,nj->ni", estimate.rotations[observed.view], bent_points(network, estimate)
+    )
+    points: FloatArray = rotated + estimate.translations[observed.view]
+    is_flat = np.abs(points[:, 2]) < _MIN_DEPTH * np.linalg.norm(points, axis=1)
+    points[is_flat, 2] = _MIN_DEPTH
     return points
 
 
@@ -102,27 +107,27 @@ def whitened(network: Network, residuals: FloatArray, weights: FloatArray) -> Fl
 
 
 def view_rows(network: Network, estimate: Estimate, weights: FloatArray) -> list[ViewRows]:
-    """Return the whitened equations of every photograph, linear at an estimate.
+    """Return the whitened equations of every photograph, linearised at an estimate.
 
     A pose changes as in `Pose.moved`: translation, and a left rotation vector in the camera frame.
     """
-    seen, used = network.observations, np.flatnonzero(weights > 0.0)
-    view_of = seen.view[used]
+    observed, used = network.observations, np.flatnonzero(weights > 0.0)
+    view_of = observed.view[used]
     rays = _camera_points(network, estimate)[used]
     image = _images(network, estimate, network.view_camera[view_of], rays)
     x, y, z = rays.T
     zero = np.zeros_like(x)
     ray_by_point = np.stack((1.0 / z, zero, -x / z**2, zero, 1.0 / z, -y / z**2), axis=1)
     by_place = image.by_ray @ ray_by_point.reshape(-1, 2, 3)
-    by_turn = -by_place @ _cross_matrices(rays - estimate.translations[view_of])
-    white = seen.white[used] * np.sqrt(weights[used])[:, None, None]
-    by_view = [by_place, by_turn]
+    by_rotation = -by_place @ _cross_matrices(rays - estimate.translations[view_of])
+    white = observed.white[used] * np.sqrt(weights[used])[:, None, None]
+    by_view = [by_place, by_rotation]
     if network.bends is not None:
         by_height = by_place @ estimate.rotations[view_of][:, :, 2:]
-        by_view.append(by_height * network.bends.shapes[seen.point[used]][:, None, :])
+        by_view.append(by_height * network.bends.shapes[observed.point[used]][:, None, :])
     by_pose = white @ np.concatenate(by_view, axis=2)
     by_camera = white @ image.by_parameter
-    residuals = white @ (seen.places[used] - image.places)[:, :, None]
+    residuals = white @ (observed.places[used] - image.places)[:, :, None]
     by_point = None
     if not network.points.is_fixed:
         by_point = white @ by_place @ estimate.rotations[view_of]
@@ -131,19 +136,19 @@ def view_rows(network: Network, estimate: Estimate, weights: FloatArray) -> list
     bend_rows, bend_residuals = _bend_rows(network, estimate)
     equations = []
     for view, camera in enumerate(network.view_camera.tolist()):
-        own = np.flatnonzero(view_of == view)
+        in_view = np.flatnonzero(view_of == view)
         columns = camera * parameters + np.arange(parameters)
         if by_point is not None:
-            points = first_point + 3 * seen.point[used[own]][:, None] + np.arange(3)
+            points = first_point + 3 * observed.point[used[in_view]][:, None] + np.arange(3)
             columns = np.concatenate((columns, points.ravel()))
         equations.append(
             ViewRows(
-                used[own],
+                used[in_view],
                 columns,
-                by_pose[own].reshape(-1, bend_rows.shape[1]),
-                by_camera[own].reshape(-1, parameters),
-                None if by_point is None else by_point[own],
-                residuals[own].ravel(),
+                by_pose[in_view].reshape(-1, bend_rows.shape[1]),
+                by_camera[in_view].reshape(-1, parameters),
+                None if by_point is None else by_point[in_view],
+                residuals[in_view].ravel(),
                 bend_rows,
                 bend_residuals[view],
             )
@@ -163,30 +168,30 @@ def _bend_rows(network: Network, estimate: Estimate) -> tuple[FloatArray, FloatA
 def _images(
     network: Network, estimate: Estimate, cameras: IndexArray, rays: FloatArray
 ) -> ImageSlopes:
-    """Return where points (n, 3) in the frames of their cameras (n,) are seen, with derivatives."""
+    """Return the images of points (n, 3) in their cameras (n,), with derivatives."""
     count, parameters = len(rays), len(network.model.names)
-    whole = ImageSlopes(
+    images = ImageSlopes(
         np.empty((count, 2)), np.empty((count, 2, 2)), np.empty((count, 2, parameters))
     )
     normalised = rays[:, :2] / rays[:, 2:]
     for camera, values in enumerate(estimate.cameras):
-        mine = cameras == camera
-        image = network.model.image(values, normalised[mine])
-        whole.places[mine] = image.places
-        whole.by_ray[mine] = image.by_ray
-        whole.by_parameter[mine] = image.by_parameter
-    return whole
+        in_camera = cameras == camera
+        image = network.model.image(values, normalised[in_camera])
+        images.places[in_camera] = image.places
+        images.by_ray[in_camera] = image.by_ray
+        images.by_parameter[in_camera] = image.by_parameter
+    return images
 
 
 def reduce_poses(
     network: Network, estimate: Estimate, equations: list[ViewRows], damping: float = 0.0
 ) -> ReducedSystem:
-    """Return the normal equations of cameras and points.
+    """Return the normal equations of cameras and points, with the poses eliminated.
 
     Parameters
     ----------
     damping : float
-        Levenberg-Marquardt: share of each diagonal element that is added to it.
+        Levenberg-Marquardt: each diagonal element is increased by this share of itself.
     """
     size = network.cameras.values.size
     if not network.points.is_fixed:
@@ -217,10 +222,10 @@ def reduce_poses(
 
 
 def _unreduced(view: ViewRows) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return a photograph's normal matrix (k, k), its coupling with the pose (k, q), and right."""
+    """Return a photograph's normal matrix (k, k), coupling to the pose (k, q), right side (k,)."""
     if view.by_point is None:
-        by = view.by_camera
-        return by.T @ by, by.T @ view.by_pose, by.T @ view.residuals
+        design = view.by_camera
+        return design.T @ design, design.T @ view.by_pose, design.T @ view.residuals
     parameters, count = view.by_camera.shape[1], len(view.rows)
     by_camera = view.by_camera.reshape(count, 2, parameters)
     by_pose = view.by_pose.reshape(count, 2, -1)
@@ -247,7 +252,7 @@ def _unreduced(view: ViewRows) -> tuple[FloatArray, FloatArray, FloatArray]:
 def prior_equations(
     network: Network, estimate: Estimate, size: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return what is known of cameras and points beforehand, as normal equations."""
+    """Return the priors of cameras and points as normal equations."""
     normal, right = np.zeros((size, size)), np.zeros(size)
     information = network.cameras.sd.ravel() ** -2.0
     cameras = np.arange(network.cameras.values.size)
@@ -284,7 +289,7 @@ def _bar_row(bar: ScaleBar, points: FloatArray, first: int) -> tuple[IndexArray,
 
 
 def prior_cost(network: Network, estimate: Estimate) -> float:
-    """Return the weighted sum of squares of what deviates from priors, bars and no bend."""
+    """Return the weighted squares of all priors' residuals: cameras, points, bars and bends."""
     cost = float(np.sum(((estimate.cameras - network.cameras.values) / network.cameras.sd) ** 2))
     prior: PointPrior = network.points
     if prior.information is not None:
@@ -301,7 +306,7 @@ def prior_cost(network: Network, estimate: Estimate) -> float:
 def moved(
     network: Network, estimate: Estimate, system: ReducedSystem, step: FloatArray
 ) -> Estimate:
-    """Return the estimate after a step (u,) of the reduced unknowns, with the poses that follow."""
+    """Return the estimate after a step (u,) of the reduced unknowns; the poses follow from it."""
     pose_steps = [
         np.linalg.solve(normal, right - coupling.T @ step[columns])
         for normal, right, coupling, columns in zip(
@@ -321,30 +326,30 @@ def moved(
 
 
 def inner_constraints(network: Network, points: FloatArray) -> FloatArray:
-    """Return the directions (u, d) of the unknowns in which the whole field may move.
+    """Return the inner constraints of a free network as orthonormal columns (u, d).
 
-    Shift, turn and, without a bar, scale of all points about their mean, as orthonormal columns.
-    The adjustment of a free network keeps its points from moving along them.
+    They are the directions in which the whole field may move without changing any image: shift,
+    rotation and, without a bar, scale of all points about their mean.
     """
     cameras = network.cameras.values.size
     defect = network.points.datum_defect
     centred = points - points.mean(axis=0)
     shifts = np.tile(np.eye(3), (len(points), 1))
-    turns = -_cross_matrices(centred).reshape(-1, 3)
+    rotations = -_cross_matrices(centred).reshape(-1, 3)
     scale = centred.reshape(-1, 1)
-    whole = np.hstack((shifts, turns, scale))[:, :defect]
+    similarity = np.hstack((shifts, rotations, scale))[:, :defect]
     basis = np.zeros((cameras + points.size, defect))
-    basis[cameras:] = np.linalg.qr(whole)[0]
+    basis[cameras:] = np.linalg.qr(similarity)[0]
     return basis
 
 
 def scales_of(normal: FloatArray) -> FloatArray:
-    """Return what makes the diagonal of reduced normal equations (u, u) ones (u,).
+    """Return the factors (u,) that scale the diagonal of normal equations (u, u) to ones.
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        If an unknown is not determined: what the poses leave of it is less than its rounding.
+        If an unknown is not determined: after elimination, its diagonal element is only rounding.
     """
     diagonal = normal.diagonal()
     if not np.all(diagonal > 0.0):
@@ -353,13 +358,13 @@ def scales_of(normal: FloatArray) -> FloatArray:
 
 
 def bordered_by(normal: FloatArray, basis: FloatArray) -> FloatArray:
-    """Return normal equations (u, u) with constraints (u, d) on their unknowns."""
+    """Return normal equations (u, u) bordered by constraints (u, d) on their unknowns."""
     corner = np.zeros((basis.shape[1],) * 2)
     return np.block([[normal, basis], [basis.T, corner]])
 
 
 def _cross_matrices(vectors: FloatArray) -> FloatArray:
-    """Return the matrices (n, 3, 3) of the products v × ·."""
+    """Return the cross-product matrices (n, 3, 3) of vectors (n, 3)."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     rows = np.stack((zero, -z, y, z, zero, -x, -y, x, zero), axis=1)

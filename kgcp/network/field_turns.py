@@ -1,4 +1,8 @@
-"""How a symmetric field lies in each photograph: upright, or turned so that it looks the same."""
+"""Orientation of a symmetric field in each photograph: as named, or turned to look the same.
+
+Images alone do not show the difference. But the true shape of the field is not exactly symmetric,
+and once it is estimated, one of the orientations fits better.
+"""
 
 from __future__ import annotations
 
@@ -11,35 +15,37 @@ from kgcp.geometry.pose import Pose
 from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem
 from kgcp.network.start import refined_poses
 
-_CLEAR_TURN = 1.5  # times the sum of squares: the field's own shape tells its ends apart
+# Smallest ratio of the sums of squares, of the next best to the best orientation, from which on the
+# shape of the field distinguishes the two.
+_CLEAR_COST_RATIO = 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Turn:
-    """Another way in which a symmetric field may lie in a photograph."""
+    """A symmetry of the field applied in one photograph."""
 
-    cost_ratio: float  # its sum of squares over that of the present one
-    permutation: IndexArray  # (m,): which disc takes the place of which
+    cost_ratio: float  # its sum of squares over that of the present orientation
+    permutation: IndexArray  # (m,): disc permutation[i] takes the place of disc i
     pose: Pose
 
 
 def with_turns(
     problem: CalibrationProblem, state: AdjustedNetwork
 ) -> tuple[CalibrationProblem, AdjustedNetwork, bool]:
-    """Turn a symmetric field in photographs where its own shape fits better turned.
+    """Rename the discs of photographs in which the shape of a symmetric field fits better turned.
 
     Returns
     -------
     problem, state
-        With the discs named accordingly.
+        With the discs renamed.
     is_unclear : bool
-        Whether some photograph fits nearly as well either way.
+        Whether two orientations fit nearly equally well in some photograph.
     """
     for _ in range(len(problem.views)):
         turns = [_best_turn(problem, state, view) for view in range(len(problem.views))]
         worst = min(range(len(turns)), key=lambda view: turns[view].cost_ratio)
         if turns[worst].cost_ratio >= 1.0:
-            return problem, state, turns[worst].cost_ratio < _CLEAR_TURN
+            return problem, state, turns[worst].cost_ratio < _CLEAR_COST_RATIO
         views = list(problem.views)
         point = turns[worst].permutation[views[worst].point]
         views[worst] = replace(views[worst], point=point)
@@ -56,21 +62,21 @@ def with_turns(
 
 
 def _best_turn(problem: CalibrationProblem, state: AdjustedNetwork, view: int) -> _Turn:
-    """Return how else a symmetric field could lie in a photograph."""
+    """Return the best of the other orientations of a symmetric field in a photograph."""
     observed = state.network.observations
-    own = observed.chosen((observed.view == view) & state.solution.is_used)
-    own = replace(own, view=np.zeros(len(own.view), dtype=np.intp))
+    in_view = observed.chosen((observed.view == view) & state.solution.is_used)
+    in_view = replace(in_view, view=np.zeros(len(in_view.view), dtype=np.intp))
     points, pose = state.estimate.points, state.poses[view]
     bends = state.network.bends
-    _, cost = refined_poses(state.camera, own, points, [pose], bends)
+    _, cost = refined_poses(state.camera, in_view, points, [pose], bends)
     turns = []
     for permutation in problem.field.symmetries():
-        turned = replace(own, point=permutation[own.point])
+        turned = replace(in_view, point=permutation[in_view.point])
         guess = _turned_pose(pose, problem.field.points_m(), permutation)
-        refined, other = refined_poses(state.camera, turned, points, [guess], bends)
+        refined, turned_cost = refined_poses(state.camera, turned, points, [guess], bends)
         turns.append(
             _Turn(
-                float(other[0] / cost[0]),
+                float(turned_cost[0] / cost[0]),
                 permutation,
                 Pose(refined.rotations[0], refined.translations[0]),
             )
@@ -79,9 +85,9 @@ def _best_turn(problem: CalibrationProblem, state: AdjustedNetwork, view: int) -
 
 
 def _turned_pose(pose: Pose, points: FloatArray, turn: IndexArray) -> Pose:
-    """Return the pose under which point i has the image that point turn[i] is to have."""
+    """Return the pose in which point turn[i] has the image that point i has in the given pose."""
     middle = points.mean(axis=0)
-    # turn[i] is where the turn S takes point i, so that R X_i + t = R Sᵀ X_turn[i] + t'
+    # The symmetry S takes point i to point turn[i]: R X_i + t = R Sᵀ X_turn[i] + t'.
     across, image = (points - middle)[:, :2], (points[turn] - middle)[:, :2]
     u, _, vt = np.linalg.svd(image.T @ across)
     back = np.eye(3)

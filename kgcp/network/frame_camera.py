@@ -1,4 +1,4 @@
-"""kgcp's frame camera as the model of an adjustment."""
+"""kgcp's frame camera as the camera model of an adjustment."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from kgcp.geometry.camera import Camera
 from kgcp.network.records import ImageSlopes
 
 DISTORTION = CALIBRATION_PARAMETERS[4:]
-"""Terms of distortion, of which an adjustment may have any."""
+"""Distortion terms; an adjustment may estimate any of them."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameCameraModel:
     """A frame camera some of whose parameters are unknown.
 
-    With `is_same_aspect` the one principal distance is fx, and fy keeps its ratio to it.
+    With `is_same_aspect`, fx is the only unknown principal distance, and fy / fx stays constant.
     """
 
-    template: Camera  # frame size, and the values of the parameters that stay as they are
-    distortion: tuple[str, ...]  # of `DISTORTION`
+    template: Camera  # frame size, and the values of parameters that are not estimated
+    distortion: tuple[str, ...]  # estimated terms of `DISTORTION`
     is_same_aspect: bool = True
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the unknowns: `fx` alone where it stands for both principal distances."""
+        """Names of the unknowns."""
         focal = ("fx",) if self.is_same_aspect else ("fx", "fy")
         return (*focal, "cx", "cy", *self.distortion)
 
@@ -50,7 +50,7 @@ class FrameCameraModel:
         """Map normalised coordinates (n, 2) to pixels (n, 2); NaN if there is no such camera."""
         try:
             return self.camera(values).distort(normalised)
-        except SettingError:  # a step of the adjustment that went too far
+        except SettingError:  # a step of the adjustment was too large
             return np.full(normalised.shape, np.nan)
 
     def image(self, values: FloatArray, normalised: FloatArray) -> ImageSlopes:
@@ -63,7 +63,7 @@ class FrameCameraModel:
         )
 
     def to_calibration(self) -> FloatArray:
-        """Return how `CALIBRATION_PARAMETERS` follow the unknowns (12, p)."""
+        """Return the derivatives (12, p) of `CALIBRATION_PARAMETERS` by the unknowns."""
         matrix = np.zeros((len(CALIBRATION_PARAMETERS), len(self.names)))
         for column, name in enumerate(self.names):
             matrix[CALIBRATION_PARAMETERS.index(name), column] = 1.0

@@ -1,4 +1,4 @@
-"""Which parameters of the camera are worth estimating."""
+"""Choice of the camera parameters that are worth estimating."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ from kgcp.network.covariance import precision
 from kgcp.network.records import Network, Observations, PointPrior
 from kgcp.network.start import refined_poses
 
-DETERMINED = 0.3  # of its prior deviation: what is known no better is not determined
-_SIGNIFICANT = 0.001
+# Largest standard deviation of a parameter that counts as determined, relative to the a-priori one.
+DETERMINED = 0.3
+_SIGNIFICANCE_LEVEL = 0.001
 _FOLDS = 5
-_LEAST_GAIN = 0.005  # of the misfit of photographs that took no part
-# Mean of the field's directions in the photographs, doubled so that half a turn is none. Above,
-# the camera was hardly turned, and a stretched print looks like pixels that are not square.
-_MOST_ALIKE = 0.95
+_MIN_GAIN = 0.005  # relative decrease of the misfit in cross-validation
+# Largest length of the mean unit vector of the field's directions in the photographs. Directions
+# are doubled, so that opposite ones agree. Above this limit, the camera was hardly rotated about
+# its axis; a stretched print then looks like pixels that are not square.
+_MAX_DIRECTION_MEAN = 0.95
 
 _TERMS: dict[LensModel, tuple[str, ...]] = {
     LensModel.RADIAL: ("k1", "k2"),
@@ -35,11 +37,11 @@ _ADDITIONS: tuple[tuple[str, ...], ...] = (_ASPECT, ("k2",), ("p1", "p2"), ("k3"
 
 
 def with_chosen_parameters(problem: CalibrationProblem, state: AdjustedNetwork) -> AdjustedNetwork:
-    """Return the adjustment with the terms asked for, or with as many as are worth it.
+    """Return the adjustment with the requested distortion terms, or with those worth estimating.
 
-    Every lens has k1. Another term, or a second focal length, is worth it if it is significant over
-    the places of the photographs, known better than beforehand, and places that took no part in its
-    estimation fit better with it.
+    k1 is always estimated. Another term, or a second focal length, is worth estimating under three
+    conditions. It is significant by its scatter between places. It is known better than a priori.
+    And in cross-validation, places left out of the estimation fit better with it.
     """
     settings = problem.settings
     terms = _TERMS.get(settings.lens, ("k1",))
@@ -55,8 +57,8 @@ def with_chosen_parameters(problem: CalibrationProblem, state: AdjustedNetwork) 
     for addition in _ADDITIONS if is_aspect_open else _ADDITIONS[1:]:
         trial = problem.with_unknowns(kept, _with(kept.unknowns, addition))
         trial_misfit = validation.misfit(trial)
-        is_better = trial_misfit < (1.0 - _LEAST_GAIN) * misfit
-        if is_better and _is_worth_it(trial, addition):
+        is_better = trial_misfit < (1.0 - _MIN_GAIN) * misfit
+        if is_better and _is_significant(trial, addition):
             kept, misfit = trial, trial_misfit
     return kept
 
@@ -68,64 +70,66 @@ def _with(unknowns: NetworkUnknowns, addition: tuple[str, ...]) -> NetworkUnknow
 
 
 def _is_camera_turned(state: AdjustedNetwork) -> bool:
-    """Tell whether photographs were taken with the camera turned about its axis."""
+    """Tell whether some photographs were taken with the camera rotated about its axis."""
     across = state.estimate.rotations[:, :2, 0]
     directions = np.arctan2(across[:, 1], across[:, 0])
-    return bool(np.abs(np.mean(np.exp(2j * directions))) < _MOST_ALIKE)
+    return bool(np.abs(np.mean(np.exp(2j * directions))) < _MAX_DIRECTION_MEAN)
 
 
-def _is_worth_it(state: AdjustedNetwork, addition: Sequence[str]) -> bool:
-    """Tell whether terms are determined, and one of them is larger than by chance."""
-    known = precision(state.network, state.solution)
-    freedom = max(int(known.places.max()), 1)
-    limit = stats.t.ppf(1.0 - 0.5 * _SIGNIFICANT / len(addition), freedom)
-    cov = known.camera_cov
+def _is_significant(state: AdjustedNetwork, addition: Sequence[str]) -> bool:
+    """Tell whether all added terms are determined and at least one is significant."""
+    estimated = precision(state.network, state.solution)
+    freedom = max(int(estimated.places.max()), 1)
+    limit = stats.t.ppf(1.0 - 0.5 * _SIGNIFICANCE_LEVEL / len(addition), freedom)
+    cov = estimated.camera_cov
     names = state.network.model.names
     values = state.estimate.cameras[0]
     columns = [names.index(name) for name in addition]
-    if tuple(addition) == _ASPECT:  # which is there if fy is another length than fx
+    if tuple(addition) == _ASPECT:  # tests fy - fx
         slope = np.zeros(len(names))
         slope[[names.index("fx"), *columns]] = -1.0, 1.0
         return bool(abs(slope @ values) > limit * np.sqrt(slope @ cov @ slope))
     sd = np.sqrt(cov.diagonal()[columns])
-    is_known = sd < DETERMINED * state.network.cameras.sd[0, columns]
+    is_determined = sd < DETERMINED * state.network.cameras.sd[0, columns]
     is_large = np.abs(values[columns]) > limit * sd
-    return bool(is_known.all() and is_large.any())
+    return bool(is_determined.all() and is_large.any())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _CrossValidation:
-    """Places that take no part in the estimation, in turns (cross-validation).
+    """Cross-validation: places are left out of the estimation in turn.
 
     All models are judged by the same discs with the same covariances.
     """
 
     observations: Observations
     is_used: BoolArray
-    places: IndexArray  # (v,): of the photographs, by `place_numbers`
+    places: IndexArray  # (v,): place of each photograph, by `place_numbers`
 
     def misfit(self, state: AdjustedNetwork) -> float:
-        """Return the mean square of the residuals of places that took no part."""
+        """Return the mean square of the whitened residuals in places that were left out."""
         network, estimate = state.network, state.estimate
-        # the field as it is estimated by all: only the camera is on trial
+        # the field stays as estimated from all places: only the camera is tested
         points = PointPrior(estimate.points, None)
-        own = replace(
+        training = replace(
             network,
             points=points,
             observations=network.observations.chosen(state.solution.is_used),
         )
         measured = replace(network.observations, cov=self.observations.cov)
-        judged = replace(own, observations=measured.chosen(self.is_used))
+        validation = replace(training, observations=measured.chosen(self.is_used))
         misfits: list[FloatArray] = []
         for fold in range(min(_FOLDS, int(self.places.max()) + 1)):
             is_left_out = self.places % _FOLDS == fold
             start = estimate.part(~is_left_out)
-            values = adjust_network(_part(own, ~is_left_out), start, ROBUST).estimate.cameras[0]
-            left = _part(judged, is_left_out).observations
+            values = adjust_network(_part(training, ~is_left_out), start, ROBUST).estimate.cameras[
+                0
+            ]
+            left_out = _part(validation, is_left_out).observations
             poses = [state.poses[view] for view in np.flatnonzero(is_left_out).tolist()]
             camera = state.model.camera(values)
-            _, costs = refined_poses(camera, left, estimate.points, poses, network.bends)
-            misfits.append(costs / np.bincount(left.view))
+            _, costs = refined_poses(camera, left_out, estimate.points, poses, network.bends)
+            misfits.append(costs / np.bincount(left_out.view))
         return float(np.mean(np.concatenate(misfits)))
 
 

@@ -1,4 +1,4 @@
-"""What a network of photographs consists of, and what its adjustment returns."""
+"""Records of a network of photographs and of its adjustment."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from kgcp.geometry.pose import rotation_about
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageSlopes:
-    """Places of n points in the image, and how they move."""
+    """Image coordinates of n points, with derivatives."""
 
     places: FloatArray  # (n, 2), in the unit of the image: pixels, or millimetres on the sensor
-    by_ray: FloatArray  # (n, 2, 2): by the normalised coordinates x/z, y/z
-    by_parameter: FloatArray  # (n, 2, p): by the parameters of the camera
+    by_ray: FloatArray  # (n, 2, 2): derivatives by the normalised coordinates x/z, y/z
+    by_parameter: FloatArray  # (n, 2, p): derivatives by the parameters of the camera
 
 
 class CameraModel(Protocol):
-    """A model of the camera, with the parameters that an adjustment may change."""
+    """A camera model with parameters that an adjustment may estimate."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -46,36 +46,35 @@ class ScaleBar:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointPrior:
-    """Where the points of a field are supposed to be, and how firmly.
+    """The a-priori coordinates of a field's points.
 
-    Bars alone determine the scale: `nominal` then says no more than the field's shape.
+    If there are bars, they alone determine the scale; `nominal` then only describes the shape.
     """
 
     nominal: FloatArray  # (m, 3)
-    # (m, 3, 3): inverse covariances of the deviations from `nominal`; zeros: free; None: the points
-    # are exactly at `nominal`
+    # (m, 3, 3): inverse covariances of the deviations from `nominal`; zeros: the points are free;
+    # None: they are fixed at `nominal`
     information: FloatArray | None
     bars: tuple[ScaleBar, ...] = ()
 
     @property
     def is_fixed(self) -> bool:
-        """Whether the points are no unknowns."""
+        """Whether the points are held at `nominal`."""
         return self.information is None
 
     @property
     def datum_defect(self) -> int:
-        """How many of shift, turn and scale nothing determines but inner constraints: 0, 6 or 7."""
+        """Number of inner constraints for shift, rotation and scale of the points: 0, 6 or 7."""
         if self.information is None or np.any(self.information):
             return 0
         return 6 if self.bars else 7
 
     @property
     def scale_row(self) -> FloatArray | None:
-        """The row (3m,) by which an unknown scale of `nominal` reduces the information.
+        """The row r (3m,) that removes the scale of `nominal` from its information.
 
-        What is known of the points without their scale has the information P - r rᵀ, where
-        r = P d / √(dᵀ P d) and d is the change of the points by the scale. None: nothing is
-        reduced.
+        Let P be the information about the points and d their change by the scale. With an unknown
+        scale, P - r rᵀ remains, where r = P d / √(dᵀ P d). None: the scale is part of the prior.
         """
         if self.information is None or not self.bars or not np.any(self.information):
             return None
@@ -86,18 +85,18 @@ class PointPrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BendPrior:
-    """How a sheet may bend from photograph to photograph, out of its plane."""
+    """Bends of a sheet out of its plane, different in every photograph."""
 
-    shapes: FloatArray  # (m, b): heights of the points in each of b bends
-    sd: float  # of the amount of each bend in each photograph
+    shapes: FloatArray  # (m, b): heights of the points in each of b bends of amount 1
+    sd: float  # a-priori standard deviation of the amount of each bend in each photograph
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationPrior:
-    """What is known beforehand of the parameters of the cameras."""
+    """A-priori values of the camera parameters."""
 
     values: FloatArray  # (c, p)
-    sd: FloatArray  # (c, p); infinite: nothing is known
+    sd: FloatArray  # (c, p); infinite: unknown
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,18 +121,18 @@ class Observations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Network:
-    """Observations, and what the adjustment may know and change."""
+    """Observations and priors of an adjustment."""
 
     model: CameraModel
     view_camera: IndexArray  # (v,): index of each photograph's camera
     observations: Observations
     points: PointPrior
     cameras: CalibrationPrior
-    bends: BendPrior | None = None  # None: the points are where they are in all photographs
+    bends: BendPrior | None = None  # None: the field is the same in all photographs
 
     @property
     def bend_count(self) -> int:
-        """How many bends each photograph has."""
+        """Number of bends per photograph."""
         return 0 if self.bends is None else self.bends.shapes.shape[1]
 
 
@@ -145,11 +144,11 @@ class Estimate:
     rotations: FloatArray  # (v, 3, 3): p_cam = R p + t
     translations: FloatArray  # (v, 3)
     points: FloatArray  # (m, 3)
-    # (v, b): how much of each bend the field has in each photograph
+    # (v, b): amount of each bend in each photograph
     bends: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def part(self, which: BoolArray | IndexArray) -> Estimate:
-        """Return the estimate of some photographs."""
+        """Return the estimate reduced to some photographs."""
         bends = self.bends[which] if self.bends.size else self.bends
         return replace(
             self,
@@ -158,24 +157,24 @@ class Estimate:
             bends=bends,
         )
 
-    def unbent(self, count: int) -> Estimate:
-        """Return the estimate with so many bends, of which the field has none."""
+    def with_zero_bends(self, count: int) -> Estimate:
+        """Return the estimate with `count` bends, all of amount zero."""
         return replace(self, bends=np.zeros((len(self.rotations), count)))
 
     def moved(self, cameras: FloatArray, poses: FloatArray, points: FloatArray) -> Estimate:
-        """Return the values after steps of cameras (c p,), and of poses and bends (v, 6 + b).
+        """Return the estimate after steps of cameras (c p,), and of poses and bends (v, 6 + b).
 
         Poses move as in `Pose.moved`.
 
         Parameters
         ----------
         points : (m, 3) array
-            The new ones.
+            The new coordinates, not a step.
         """
-        turns = np.array([rotation_about(turn) for turn in poses[:, 3:6]])
+        rotations = np.array([rotation_about(vector) for vector in poses[:, 3:6]])
         return Estimate(
             self.cameras + cameras.reshape(self.cameras.shape),
-            turns @ self.rotations,
+            rotations @ self.rotations,
             self.translations + poses[:, :3],
             points,
             self.bends + poses[:, 6:] if self.bends.size else self.bends,
@@ -189,21 +188,20 @@ class Solution:
     estimate: Estimate
     residuals: FloatArray  # (n, 2): observed minus computed
     is_used: BoolArray  # (n,): whether a disc was kept
-    weights: FloatArray  # (n,): robust weights in 0…1; 0 where a disc was rejected
+    weights: FloatArray  # (n,): robust weights in 0…1; 0: rejected
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Precision:
-    """How well a network determines its unknowns.
+    """Precision of a network's unknowns.
 
-    `inverse` is that of the reduced normal equations: poses eliminated, cameras first, then points
-    if they are unknowns. It has the scale of the stated covariances; `variance_factor` multiplies
-    it.
+    Cofactors refer to the stated covariances; times `variance_factor`, they are covariances.
     """
 
     variance_factor: float  # s₀²
-    inverse: FloatArray  # (u, u)
-    pose_inverses: FloatArray  # (v, 6, 6): translation, left rotation vector; as `inverse`
-    redundancy: FloatArray  # (n,): of the two coordinates together, 0…2
-    camera_cov: FloatArray  # (c p, c p): clustered by place, never below s₀² N⁻¹
+    # (u, u): cofactors of the reduced unknowns: cameras, then points unless they are fixed
+    inverse: FloatArray
+    pose_inverses: FloatArray  # (v, 6, 6): cofactors of translation and left rotation vector
+    redundancy: FloatArray  # (n,): sum over the two coordinates, 0…2
+    camera_cov: FloatArray  # (c p, c p): clustered by place, at least s₀² N⁻¹
     places: IndexArray  # (v,): number of each photograph's place, by `place_numbers`

@@ -1,4 +1,4 @@
-"""Where to begin: focal length and poses from homographies of a planar field."""
+"""Start values for a planar field: focal length and poses from homographies."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from kgcp.network.records import (
 )
 
 FOCALS = (0.5, 0.8, 1.2, 2.0, 3.2, 5.0, 8.0, 12.0)
-"""To try to begin with: multiples of the longer side of the frame."""
-_KNOWN = 1e-9  # standard deviation of parameters that are not to change
+"""Focal lengths that are tried as start values, as multiples of the frame's longer side."""
+_KNOWN_SD = 1e-9  # standard deviation of parameters that must not change
 
 
 def start_camera_and_poses(
@@ -33,18 +33,18 @@ def start_camera_and_poses(
 ) -> tuple[Camera, Estimate]:
     """Return a camera without distortion and the pose of every photograph.
 
-    The focal length is that of `FOCALS` or of Zhang's closed form (2000) whose poses fit best,
-    with the principal point in the middle. Every planar pose has a twin, of which the better is
-    taken.
+    The principal point is in the middle. Focal lengths are tried: `FOCALS` and that of Zhang's
+    closed form (2000). The one with the best-fitting poses is taken. Every pose of a plane has a
+    mirrored twin, and the better of the two counts.
     """
     width, height = size
     centre = np.array([0.5 * (width - 1), 0.5 * (height - 1)])
     count = int(observations.view.max()) + 1
     homographies = []
     for view in range(count):
-        mine = observations.view == view
-        flat = points[observations.point[mine], :2]
-        homographies.append(homography_between(flat, observations.places[mine] - centre))
+        in_view = observations.view == view
+        flat = points[observations.point[in_view], :2]
+        homographies.append(homography_between(flat, observations.places[in_view] - centre))
     focals = {share * max(size) for share in FOCALS}
     closed = _closed_focal(homographies)
     if closed is not None:
@@ -57,22 +57,22 @@ def start_camera_and_poses(
             for view, homography in enumerate(homographies)
         ]
         estimate, costs = better_poses(camera, observations, points, poses)
-        # the median of the photographs: one with wrong discs does not decide
+        # the median is robust against a photograph with wrong names
         starts.append((float(np.median(costs)), camera, estimate))
     _, camera, estimate = min(starts, key=lambda start: start[0])
     return camera, estimate
 
 
 def homography_misfits(observations: Observations, points: FloatArray) -> FloatArray:
-    """Return how badly each photograph (v,) is a perspective view of a plane.
+    """Return how far each photograph (v,) deviates from a perspective view of a plane.
 
-    The residuals' RMS over the spread of the discs: some thousandths for a lens with distortion,
-    about one if the discs have wrong names.
+    This is the RMS of the residuals relative to the spread of the discs: a few thousandths for a
+    lens with distortion, about one if the discs have wrong names.
     """
     misfits = []
     for view in range(int(observations.view.max()) + 1):
-        mine = observations.view == view
-        flat, places = points[observations.point[mine], :2], observations.places[mine]
+        in_view = observations.view == view
+        flat, places = points[observations.point[in_view], :2], observations.places[in_view]
         gaps = places - mapped(homography_between(flat, places), flat)
         spread = np.sum((places - places.mean(axis=0)) ** 2)
         misfits.append(math.sqrt(float(np.sum(gaps**2) / spread)))
@@ -82,10 +82,10 @@ def homography_misfits(observations: Observations, points: FloatArray) -> FloatA
 def better_poses(
     camera: Camera, observations: Observations, points: FloatArray, poses: list[Pose]
 ) -> tuple[Estimate, FloatArray]:
-    """Return the pose of every photograph that fits best, and its weighted sum of squares (v,).
+    """Return the best-fitting pose of every photograph, and its weighted sum of squares (v,).
 
     A planar field has two poses with nearly the same image, mirrored about the viewing ray. Both
-    are refined; one behind the camera does not count.
+    are adjusted. A pose with discs behind the camera does not count.
     """
     twins = [
         _mirrored(pose, points[observations.point[observations.view == view]])
@@ -112,7 +112,7 @@ def refined_poses(
 ) -> tuple[Estimate, FloatArray]:
     """Return poses adjusted to the discs for a known camera, and their sums of squares (v,).
 
-    With `bends`, the field may bend in each photograph, and what it bends counts in the sum.
+    With `bends`, the field may bend in each photograph; the bends' prior is part of the sum.
     """
     model = FrameCameraModel(camera, ())
     values = model.values_of(camera)[None]
@@ -121,7 +121,7 @@ def refined_poses(
         np.zeros(len(poses), dtype=np.intp),
         observations,
         PointPrior(points, None),
-        CalibrationPrior(values, np.full_like(values, _KNOWN)),
+        CalibrationPrior(values, np.full_like(values, _KNOWN_SD)),
         bends,
     )
     start = Estimate(
@@ -151,24 +151,27 @@ def _is_in_front(observations: Observations, estimate: Estimate) -> BoolArray:
 
 
 def _closed_focal(homographies: list[FloatArray]) -> float | None:
-    """Return the focal length of Zhang's conditions (2000), square pixels, centred; None: none."""
+    """Return the focal length by Zhang's conditions (2000), or None if they have no solution.
+
+    Pixels are square, and the principal point is in the middle.
+    """
     rows, right = [], []
     for homography in homographies:
         h = homography / np.linalg.norm(homography[:, :2])
         (a, b), (c, d), (e, f) = h[:, :2].tolist()
-        for flat, upright in (
+        for coefficient, constant in (
             (a * b + c * d, e * f),
             (a * a + c * c - b * b - d * d, e * e - f * f),
         ):
-            rows.append(flat)
-            right.append(-upright)
-    by = np.array(rows)
-    inverse_square = float(by @ np.array(right)) / float(by @ by)
+            rows.append(coefficient)
+            right.append(-constant)
+    design = np.array(rows)
+    inverse_square = float(design @ np.array(right)) / float(design @ design)
     return 1.0 / math.sqrt(inverse_square) if inverse_square > 0.0 else None
 
 
 def _pose(homography: FloatArray, focal: float, points: FloatArray) -> Pose:
-    """Return the pose of a plane for a homography from it to centred pixels."""
+    """Return the pose of a plane from the homography that maps it to centred pixels."""
     columns = homography / np.array([[focal], [focal], [1.0]])
     columns = columns * 2.0 / np.linalg.norm(columns[:, :2], axis=0).sum()
     middle = points.mean(axis=0)
@@ -184,5 +187,5 @@ def _mirrored(pose: Pose, points: FloatArray) -> Pose:
     """Return the other pose of a planar field: its normal mirrored about the ray of its middle."""
     middle = points.mean(axis=0)
     centre = pose.rotation @ middle + pose.translation_m
-    turned = replace(pose, translation_m=centre).mirrored()
-    return replace(turned, translation_m=centre - turned.rotation @ middle)
+    twin = replace(pose, translation_m=centre).mirrored()
+    return replace(twin, translation_m=centre - twin.rotation @ middle)

@@ -12,7 +12,7 @@ import pytest
 from benchmarks.calibrate.jaicov import compare, read_network
 from kgcp.network.adjust import PLAIN, adjust_network
 from kgcp.network.covariance import (
-    beyond_independent,
+    excess_scatter,
     fitting_covariances,
     precision,
     tangled,
@@ -186,12 +186,12 @@ def test_few_places_with_independent_errors_scatter_hardly_more_than_expected(
     """Chance makes an excess of 0.3 to 0.5 of the variances, were only what is below 0 cut off."""
     expected = np.tile(np.eye(parameters) / places, (places, 1, 1))
     pulls = rng.standard_normal((200, places, parameters)) / np.sqrt(places)
-    excess = [np.trace(beyond_independent(each, expected)) / parameters for each in pulls]
+    excess = [np.trace(excess_scatter(each, expected)) / parameters for each in pulls]
     assert 0.02 < np.mean(excess) < 0.25
     large = 5.0 * pulls[0]
     whole = large.T @ large - np.eye(parameters)
     is_more = np.linalg.eigvalsh(whole) > 0.0
-    found = np.linalg.eigvalsh(beyond_independent(large, expected))
+    found = np.linalg.eigvalsh(excess_scatter(large, expected))
     assert found[is_more] == pytest.approx(np.linalg.eigvalsh(whole)[is_more], rel=0.05)
 
 

@@ -27,7 +27,7 @@ from kgcp.network.calibration_records import (
 )
 from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem
 from kgcp.network.frame_camera import FrameCameraModel
-from kgcp.network.photographs_apart import _own_rms_px
+from kgcp.network.photographs_apart import _view_rms_px
 from kgcp.network.records import CalibrationPrior
 from kgcp.network.sheet_bends import bend_shapes
 from kgcp.quality.calibration_verdict import (
@@ -336,7 +336,7 @@ def test_a_photograph_without_any_kept_disc_is_the_worst() -> None:
         solution=replace(result.solution, is_used=used),
         estimate=result.solution.estimate,
     )
-    rms_px = _own_rms_px(cast("AdjustedNetwork", state))
+    rms_px = _view_rms_px(cast("AdjustedNetwork", state))
     assert np.argmax(rms_px) == 5
     assert np.all((rms_px[:5] > 0.003) & (rms_px[:5] < 0.03))
 
