@@ -229,7 +229,7 @@ def test_a_bad_outline_among_many_good_ones_has_deviations_of_its_own() -> None:
     placed, common = place_circles(CAMERA, many)
     worst = placed[0]
     assert isinstance(worst, PlacedCircle)
-    assert worst.is_apart
+    assert worst.has_own_noise
     assert worst.noise.outline_px == pytest.approx(0.2, rel=0.6)
     assert common.outline_px < 0.07
     z = errors_of(worst.fit.circle, truth) / np.sqrt(np.diag(worst.fit.cov))

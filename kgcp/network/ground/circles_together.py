@@ -1,7 +1,8 @@
 """Several circles in space placed together, from frames that share their errors.
 
-What the exterior orientations lack, the residuals of all circles show. A circle that was moved
-while it was photographed must not count among them, nor be placed between its places.
+Errors of the exterior orientations beyond the stated ones show in the residuals of all circles, and
+are estimated from them. A circle that was moved meanwhile must not contribute, and must not be
+placed in between.
 """
 
 from __future__ import annotations
@@ -27,28 +28,29 @@ from kgcp.network.ground.target_plane import (
     without_other,
 )
 
-_EXTRA_ROUNDS = 6  # of noise and of frames that are left out because of it
-_SETTLED_NOISE = 0.1  # change of a deviation between two rounds
-# A circle whose images are off by so many times as much as the median circle's was moved, or others
-# were taken for it. What poses lack, all circles have about alike.
-_APART, _LEAST_CIRCLES = 4.0, 3
-# Splits of two circles are alike if this share of the frames that show both are on the same sides,
-# and if their offsets differ by no more than this share of the larger one: along the rays, images
-# hardly show an offset.
-_LEAST_SAME_SIDE, _MOST_UNLIKE = 0.8, 0.75
-# A step larger than this is no error of poses that do not state it [m]: without fixed ambiguities
-# they change by decimetres, and half a degree of attitude is 0.26 m at 30 m.
-_MOST_STEP_M = 0.3
-# Each of two circles must be seen in at least so many frames to stand apart: with eight, their
+_MAX_NOISE_ROUNDS = 6  # rounds of estimating the noise and rejecting frames with it
+_SETTLED_NOISE = 0.1  # relative change of a standard deviation between two rounds
+# A circle stands apart if its noise is larger than that of the median circle by this factor: it was
+# moved, or something else was taken for it. Errors of poses are similar for all circles. At least
+# so many circles are needed for a median.
+_APART_RATIO, _MIN_CIRCLES = 4.0, 3
+# The splits of two circles are the same if at least this share of their common frames are on the
+# same side of both, and if the offsets differ by at most this share of the larger one. The second
+# limit is wide because images hardly show an offset along the rays.
+_MIN_SAME_SIDE, _MAX_OFFSET_DIFFERENCE = 0.8, 0.75
+# Largest step of reference poses beyond their stated errors [m]. Without fixed ambiguities they
+# change by decimetres, and half a degree of attitude is 0.26 m at 30 m.
+_MAX_POSE_STEP_M = 0.3
+# One of two circles can stand apart only if each is in at least so many frames. With eight, their
 # variances differ 16-fold by chance once in 70 000 flights.
-_FRAMES_OF_TWO = 8
-_MOST_FACTOR = 10.0  # of the variance, that the estimated noise may leave
-_AGREEING_FACTOR = 3.0  # of the frames that agree; three exceed it by chance once in 700
-_DRAWS = 40  # of three frames: one of them is right in 99.9 % if 60 % of the frames are
+_MIN_FRAMES_OF_TWO = 8
+_MAX_FACTOR = 10.0  # largest variance factor that is accepted with the estimated noise
+_AGREEING_FACTOR = 3.0  # the same for frames that agree; three exceed it by chance once in 700
+_DRAWS = 40  # of three frames: if 60 % of the frames are right, a draw is in 99.9 % of the cases
 
 
 class MovedCircleError(NoCircleError):
-    """A circle was moved, and no more than half of its frames show one place."""
+    """A circle was moved, and no place is shown by more than half of its frames."""
 
     def __init__(self, move: Split) -> None:
         super().__init__("no more than half of the frames show one place")
@@ -58,38 +60,39 @@ class MovedCircleError(NoCircleError):
 def place_circles(
     camera: Camera, many: Sequence[CircleViews]
 ) -> tuple[list[PlacedCircle | NoCircleError], ExtraNoise]:
-    """Place several circles, with the deviations that their residuals show together.
+    """Place several circles with the noise that their residuals show together.
 
-    A circle that was moved, as its frames before and after say, is placed by the side with more
-    frames. If all seem to move alike, the poses did; of a single circle, it cannot be told: they
-    are placed by the frames of both sides.
+    The frames before and after some moment may show two places of a circle. If it was moved, it is
+    placed from the side with more frames. If all circles seem to move alike, the poses stepped; for
+    a single circle, this cannot be decided. In these cases all frames are used.
 
-    One that stands apart by its residuals has deviations of its own, and no part in those of the
-    others. One that its residuals contradict though none stands apart, as of two circles, is placed
-    by most of its frames, or with deviations of its own.
+    A circle with far larger residuals than the others gets its own noise, and does not contribute
+    to that of the others. A circle with contradictory residuals may be left although none stands
+    apart, for example with only two circles. It is placed from the majority of its frames, or else
+    gets its own noise.
 
     Parameters
     ----------
     many : sequence of CircleViews
-        Each in the order in which its frames were taken.
+        The frames of each circle are in the order in which they were taken.
 
     Returns
     -------
     placed : list of PlacedCircle or NoCircleError
-        In the circles' order; a `MovedCircleError`, if no more than half of the frames show one
-        place.
+        In the circles' order; a `MovedCircleError` if no place is shown by more than half of the
+        frames.
     noise : ExtraNoise
-        What was added to the stated covariances of circles that do not stand apart.
+        Noise added to the stated covariances of circles that do not stand apart.
     """
     sides = [np.ones(len(views), dtype=np.bool_) for views in many]
     moves: dict[int, Split] = {}
     while True:
         chosen = [views.chosen(side) for views, side in zip(many, sides, strict=True)]
         outcomes, noise = _with_common_noise(camera, chosen)
-        found, steps = _splits(camera, chosen, outcomes)
-        if not found:
+        next_moves, steps = _moves_and_steps(camera, chosen, outcomes)
+        if not next_moves:
             break
-        for index, split in found.items():
+        for index, split in next_moves.items():
             frames = np.flatnonzero(sides[index])
             larger = split.larger_side(len(frames))
             sides[index][frames[~larger]] = False
@@ -98,9 +101,9 @@ def place_circles(
         outcome = outcomes[index]
         if isinstance(outcome, PlacedCircle):
             fit = seen_in(camera, many[index], outcome, sides[index])
-            is_most = 2 * np.count_nonzero(fit.is_used) > len(many[index])
+            is_majority = 2 * np.count_nonzero(fit.is_used) > len(many[index])
             moved = replace(outcome, fit=fit, move=move)
-            outcomes[index] = moved if is_most else MovedCircleError(move)
+            outcomes[index] = moved if is_majority else MovedCircleError(move)
     for index, split in steps.items():
         if index not in moves:
             outcomes[index] = _by_both_sides(camera, many[index], outcomes[index], split)
@@ -110,8 +113,11 @@ def place_circles(
 def _by_both_sides(
     camera: Camera, views: CircleViews, outcome: PlacedCircle | NoCircleError, split: Split
 ) -> PlacedCircle | NoCircleError:
-    """Place a circle between the places that the frames before and after a step of poses show."""
-    if isinstance(outcome, NoCircleError) or outcome.is_apart:
+    """Place a circle from the frames before and after a step of the poses.
+
+    The noise of its places is at least half of the step.
+    """
+    if isinstance(outcome, NoCircleError) or outcome.has_own_noise:
         return outcome
     off_m = float(np.linalg.norm(split.off_m))
     sights_m = np.linalg.norm(outcome.fit.circle.centre_m - views.camera_m, axis=1)
@@ -123,16 +129,16 @@ def _by_both_sides(
     return replace(again, step=split)
 
 
-def _splits(
+def _moves_and_steps(
     camera: Camera,
     many: Sequence[CircleViews],
     outcomes: Sequence[PlacedCircle | NoCircleError],
 ) -> tuple[dict[int, Split], dict[int, Split]]:
-    """Return the splits of the circles that were moved, and those that the poses may have made.
+    """Return the splits by moves of circles, and those that steps of the poses may have caused.
 
-    Poses whose errors follow each other seem to move all circles: what most gain by a second place
-    does not count, nor what others move by alike. A single circle does not tell a move from a step
-    of the poses, but for one that is larger than those are.
+    Correlated errors of the poses seem to move all circles. Therefore a circle counts as moved only
+    if it gains far more by a second place than most, and if the others do not seem to move alike.
+    For a single circle, moves and steps are distinguished only by size: poses make no large steps.
     """
     splits = {}
     for index, (views, outcome) in enumerate(zip(many, outcomes, strict=True)):
@@ -143,92 +149,102 @@ def _splits(
             if split is not None:
                 splits[index] = split
     limit = 1.0
-    if len(splits) >= _LEAST_CIRCLES:
-        limit = max(1.0, _APART * float(np.median([split.gain for split in splits.values()])))
-    found = {index: split for index, split in splits.items() if split.gain > 1.0}
+    if len(splits) >= _MIN_CIRCLES:
+        limit = max(1.0, _APART_RATIO * float(np.median([split.gain for split in splits.values()])))
+    significant = {index: split for index, split in splits.items() if split.gain > 1.0}
     moved = {
         index: split
-        for index, split in found.items()
-        if split.gain > limit and not _is_of_poses(index, many, splits)
+        for index, split in significant.items()
+        if split.gain > limit and not _is_by_poses(index, many, splits)
     }
-    stay = {index: split for index, split in splits.items() if index not in moved}
-    stepped = sum(index in found for index in stay)
-    if not stepped or 2 * stepped < len(stay):
+    unmoved = {index: split for index, split in splits.items() if index not in moved}
+    step_count = sum(index in significant for index in unmoved)
+    if not step_count or 2 * step_count < len(unmoved):
         return moved, {}
-    return moved, {index: split for index, split in stay.items() if _APART * split.gain > 1.0}
+    return moved, {
+        index: split for index, split in unmoved.items() if _APART_RATIO * split.gain > 1.0
+    }
 
 
-def _is_of_poses(index: int, many: Sequence[CircleViews], splits: Mapping[int, Split]) -> bool:
-    """Tell whether half of the other circles move alike, or a single one by what poses may."""
+def _is_by_poses(index: int, many: Sequence[CircleViews], splits: Mapping[int, Split]) -> bool:
+    """Tell whether poses may explain a split.
+
+    They may if at least half of the other circles have the same split. Without other circles, they
+    may if the offset is no larger than a step of poses.
+    """
     split = splits[index]
     if len(splits) == 1:
-        return float(np.linalg.norm(split.off_m)) < _MOST_STEP_M
-    alike = sum(
+        return float(np.linalg.norm(split.off_m)) < _MAX_POSE_STEP_M
+    same_count = sum(
         _is_same_split(many[index], split, many[other], splits[other])
         for other in splits
         if other != index
     )
-    return 2 * alike >= len(splits) - 1
+    return 2 * same_count >= len(splits) - 1
 
 
 def _is_same_split(views: CircleViews, split: Split, others: CircleViews, other: Split) -> bool:
-    """Tell whether two circles seem to move at nearly the same frame, and by nearly the same."""
+    """Tell whether two circles seem to move at nearly the same frame by nearly the same offset."""
     rows = {tuple(place): row for row, place in enumerate(others.camera_m.tolist())}
-    same = [
+    same_side = [
         (row >= split.first) == (rows[tuple(place)] >= other.first)
         for row, place in enumerate(views.camera_m.tolist())
         if tuple(place) in rows
     ]
-    if not same or np.mean(same) < _LEAST_SAME_SIDE or split.gain > _APART * other.gain:
+    if (
+        not same_side
+        or np.mean(same_side) < _MIN_SAME_SIDE
+        or split.gain > _APART_RATIO * other.gain
+    ):
         return False
     largest_m = max(np.linalg.norm(split.off_m), np.linalg.norm(other.off_m))
-    return bool(np.linalg.norm(split.off_m - other.off_m) <= _MOST_UNLIKE * largest_m)
+    return bool(np.linalg.norm(split.off_m - other.off_m) <= _MAX_OFFSET_DIFFERENCE * largest_m)
 
 
 def _with_common_noise(
     camera: Camera, many: Sequence[CircleViews]
 ) -> tuple[list[PlacedCircle | NoCircleError], ExtraNoise]:
-    """Place several circles, with the deviations that their residuals show together."""
-    noise, own = ExtraNoise(), dict[int, ExtraNoise]()
+    """Place several circles with the noise that their residuals show together."""
+    noise, own_noise = ExtraNoise(), dict[int, ExtraNoise]()
     used = [noise] * len(many)
     outcomes = [_attempt(camera, views, noise) for views in many]
-    for _ in range(_EXTRA_ROUNDS):
-        noise, own = _noise_of_all(camera, many, outcomes)
-        settled = True
+    for _ in range(_MAX_NOISE_ROUNDS):
+        noise, own_noise = _noise_of_all(camera, many, outcomes)
+        is_settled = True
         for index, views in enumerate(many):
-            if not _is_alike(used[index], own.get(index, noise)):
-                used[index] = own.get(index, noise)
+            if not _is_same_noise(used[index], own_noise.get(index, noise)):
+                used[index] = own_noise.get(index, noise)
                 outcomes[index] = _attempt(camera, views, used[index])
-                settled = False
-        if settled:
+                is_settled = False
+        if is_settled:
             break
     for index, (views, outcome) in enumerate(zip(many, outcomes, strict=True)):
         if not isinstance(outcome, PlacedCircle):
             continue
-        if index in own or outcome.fit.variance_factor > _MOST_FACTOR:
-            outcomes[index] = _by_most_frames(camera, views, noise) or _by_own_noise(
+        if index in own_noise or outcome.fit.variance_factor > _MAX_FACTOR:
+            outcomes[index] = _by_majority(camera, views, noise) or _with_own_noise(
                 camera, views, outcome
             )
     return outcomes, noise
 
 
-def _by_own_noise(
+def _with_own_noise(
     camera: Camera, views: CircleViews, outcome: PlacedCircle
 ) -> PlacedCircle | NoCircleError:
-    """Place a circle by all frames, with the deviations that its own residuals show."""
-    if outcome.fit.variance_factor > _MOST_FACTOR:
+    """Place a circle from all frames, with the noise that its own residuals show."""
+    if outcome.fit.variance_factor > _MAX_FACTOR:
         again = _attempt(camera, views, extra_noise(camera, [(views, outcome.fit)]))
         if isinstance(again, NoCircleError):
             return again
         outcome = again
-    return replace(outcome, is_apart=True)
+    return replace(outcome, has_own_noise=True)
 
 
-def _by_most_frames(camera: Camera, views: CircleViews, noise: ExtraNoise) -> PlacedCircle | None:
-    """Place a circle by the frames that most agree with; None if no more than half agree.
+def _by_majority(camera: Camera, views: CircleViews, noise: ExtraNoise) -> PlacedCircle | None:
+    """Place a circle from a majority of frames that agree; None if there is no majority.
 
-    Three frames of an even draw give each start: where a circle was moved, a start by all frames
-    leads to between its places.
+    Each start is a circle from three random frames. If a circle was moved, a start from all frames
+    would lie between its places.
     """
     rng = np.random.default_rng(0)
     for _ in range(_DRAWS):
@@ -250,7 +266,7 @@ def _by_most_frames(camera: Camera, views: CircleViews, noise: ExtraNoise) -> Pl
 def _noise_of_all(
     camera: Camera, many: Sequence[CircleViews], outcomes: Sequence[PlacedCircle | NoCircleError]
 ) -> tuple[ExtraNoise, dict[int, ExtraNoise]]:
-    """Return the deviations that circles show together, and those of circles that stand apart."""
+    """Return the noise that circles show together, and that of each circle that stands apart."""
     pairs = {
         index: (views, outcome.fit)
         for index, (views, outcome) in enumerate(zip(many, outcomes, strict=True))
@@ -258,38 +274,38 @@ def _noise_of_all(
     }
     if not pairs:
         return ExtraNoise(), {}
-    own = {index: extra_noise(camera, [pair]) for index, pair in pairs.items()}
-    apart = _apart(
-        {index: _deviation_px(pairs[index][0], own[index]) for index in pairs},
+    own_noise = {index: extra_noise(camera, [pair]) for index, pair in pairs.items()}
+    apart = _circles_apart(
+        {index: _place_sd_px(pairs[index][0], own_noise[index]) for index in pairs},
         min(int(np.count_nonzero(fit.is_used)) for _, fit in pairs.values()),
     )
     common = extra_noise(camera, [pair for index, pair in pairs.items() if index not in apart])
-    return common, {index: own[index] for index in apart}
+    return common, {index: own_noise[index] for index in apart}
 
 
-def _apart(deviation_px: Mapping[int, float], frames: int) -> set[int]:
-    """Return the circles whose images are off by far more than those of most.
+def _circles_apart(sds_px: Mapping[int, float], frames: int) -> set[int]:
+    """Return the circles whose images are far noisier than those of most.
 
-    Of two circles the worse one, if both are seen in enough frames to know their deviations.
+    Of two circles it is the worse one, if both are in enough frames to know their noise.
     """
-    if len(deviation_px) == 2 and frames >= _FRAMES_OF_TWO:
-        best, worst = sorted(deviation_px, key=lambda index: deviation_px[index])
-        return {worst} if deviation_px[worst] > _APART * deviation_px[best] else set()
-    if len(deviation_px) < _LEAST_CIRCLES:
+    if len(sds_px) == 2 and frames >= _MIN_FRAMES_OF_TWO:
+        best, worst = sorted(sds_px, key=lambda index: sds_px[index])
+        return {worst} if sds_px[worst] > _APART_RATIO * sds_px[best] else set()
+    if len(sds_px) < _MIN_CIRCLES:
         return set()
-    limit_px = _APART * float(np.median(list(deviation_px.values())))
-    apart = {index for index, px in deviation_px.items() if px > limit_px}
-    return apart if 2 * len(apart) < len(deviation_px) else set()
+    limit_px = _APART_RATIO * float(np.median(list(sds_px.values())))
+    apart = {index for index, px in sds_px.items() if px > limit_px}
+    return apart if 2 * len(apart) < len(sds_px) else set()
 
 
-def _deviation_px(views: CircleViews, noise: ExtraNoise) -> float:
-    """Return the deviation of a circle's places in its images, per coordinate [px]."""
+def _place_sd_px(views: CircleViews, noise: ExtraNoise) -> float:
+    """Return the standard deviation of a circle's places in its images, per coordinate [px]."""
     stated = 0.5 * float(np.median(np.trace(views.cov[:, :2, :2], axis1=1, axis2=2)))
     return math.sqrt(stated + noise.centre_px**2)
 
 
-def _is_alike(first: ExtraNoise, second: ExtraNoise) -> bool:
-    """Tell whether another adjustment with this noise would change next to nothing."""
+def _is_same_noise(first: ExtraNoise, second: ExtraNoise) -> bool:
+    """Tell whether two noises are so similar that a new adjustment would change almost nothing."""
     return bool(
         np.allclose(
             (first.centre_px, first.outline_px, first.centre_factor, first.outline_factor),

@@ -1,9 +1,10 @@
-"""EO devices: a few points whose own geometry tells which is which.
+"""EO devices: a few points that are identified by their geometry alone.
 
 A device has four to eight points in its own frame, mostly five with one out of plane. Their images
-have no names. Three image points are taken for every ordered three of the device's points (P3P),
-the rest is projected and assigned. The best permutations are adjusted, with the focal length if it
-is known roughly only. The one with the smallest residuals is taken, if it is by far the smallest.
+have no names. Three image points are assigned to every ordered triple of the device's points, which
+gives poses (P3P); the other points are projected and assigned. The best permutations are adjusted,
+together with the focal length if it is only roughly known. The one with the smallest residuals
+counts if these are by far the smallest.
 """
 
 from __future__ import annotations
@@ -25,17 +26,18 @@ from kgcp.network.ground.pose_hypotheses import three_point_poses
 from kgcp.network.ground.resection import NoPoseError
 
 DEVICE_MARGIN = 3.0
-"""RMS of the next best permutation over that of the best, from which on the best counts."""
+"""Least ratio of the RMS of the next best permutation to that of the best one."""
 
 LEAST_POINTS, MOST_POINTS = 4, 8
-_FARTHEST_M = 1000.0
-_ALIKE = 0.03  # of the device's size: distances that differ by less are the same
-_FOCALS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # starts, in standard deviations of the logarithm
-_REFINED = 12  # permutations that are adjusted
-# RMS of the residuals, at most: of the device's size in the image, which is 0.5 mm of 0.3 m in
-# every place; what discs are off by their edges is less than the floor. A device that is mirrored,
-# or whose axes are exchanged, is off by 0.1 to 1 %.
-_MOST_RMS, _MOST_RMS_FLOOR_PX = 0.001, 0.1
+_MAX_COORDINATE_M = 1000.0
+_SAME = 0.03  # distances that differ by less, relative to the device's size, count as equal
+_FOCAL_SIGMAS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # start values, in standard deviations of the logarithm
+_MAX_REFINED = 12  # permutations that are adjusted, the best ones first
+# Largest RMS of the residuals: relative to the device's size in the image, or in pixels if that is
+# more. The first corresponds to 0.5 mm in each of the positions of a device of 0.3 m. The second is
+# more than displaced edges of discs cause. If a device is mirrored or its axes are exchanged, the
+# RMS is 0.1 to 1 % of the size.
+_MAX_RMS, _MAX_RMS_PX = 0.001, 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,12 +51,12 @@ class DevicePose:
     cov : (6, 6) or (7, 7) array
         As of `Resection`, times the residuals' variance factor if that is above 1.
     names : (n,) array
-        Which point of the device each image point is.
+        Index of each image point among the device's points.
     rms_px : float
-        Of the residuals, per coordinate.
+        RMS of the residuals, per coordinate.
     margin : float
-        RMS of the next best permutation over this one's, which counts as no smaller than the
-        stated deviation.
+        RMS of the next best permutation over this one's, which counts as at least the stated
+        standard deviation.
     """
 
     pose: CameraPose
@@ -65,45 +67,47 @@ class DevicePose:
 
     @property
     def in_words(self) -> str:
-        """How well it fits."""
+        """The quality of the fit."""
         return f"RMS {self.rms_px:.3f} px, margin {self.margin:.0f}"
 
 
 def require_distinct(points_m: FloatArray) -> None:
-    """Refuse a device (n, 3) that looks the same with its points exchanged.
+    """Refuse a device (n, 3) that looks the same with some of its points exchanged.
 
     Raises
     ------
     SettingError
-        Naming the points, if the device has too few, too many, or a symmetry: a turn that brings
-        all points to places of others.
+        If the device has too few or too many points, or a symmetry: a rotation that maps the points
+        to each other. The message names the points.
     """
     count = len(points_m)
     if not LEAST_POINTS <= count <= MOST_POINTS:
         raise SettingError("device", f"has {count} points", f"give {LEAST_POINTS} to {MOST_POINTS}")
-    if not np.abs(points_m).max() <= _FARTHEST_M:
+    if not np.abs(points_m).max() <= _MAX_COORDINATE_M:
         raise SettingError(
-            "device", f"has a point farther than {_FARTHEST_M:g} m", "give positions in metres"
+            "device",
+            f"has a point farther than {_MAX_COORDINATE_M:g} m",
+            "give positions in metres",
         )
     gaps = np.linalg.norm(points_m[:, None] - points_m[None], axis=-1)
     size = float(gaps.max())
     orders = np.array(list(itertools.permutations(range(count))))[1:]
     change = np.abs(gaps[orders[:, :, None], orders[:, None, :]] - gaps).max(axis=(1, 2))
-    for order in orders[change <= _ALIKE * size]:
-        if _misfit(points_m, points_m[order]) <= _ALIKE * size:
-            moved = [str(i + 1) for i in np.flatnonzero(order != np.arange(count)).tolist()]
+    for order in orders[change <= _SAME * size]:
+        if _misfit(points_m, points_m[order]) <= _SAME * size:
+            exchanged = [str(i + 1) for i in np.flatnonzero(order != np.arange(count)).tolist()]
             raise SettingError(
                 "device",
-                f"looks the same with its points {', '.join(moved)} exchanged",
+                f"looks the same with its points {', '.join(exchanged)} exchanged",
                 "move one of them: distances must differ by more than 3 % of the device's size",
             )
 
 
 def _misfit(points_m: FloatArray, others_m: FloatArray) -> float:
-    """Return the largest distance of points that are turned, but not mirrored, onto others."""
-    here, there = points_m - points_m.mean(axis=0), others_m - others_m.mean(axis=0)
-    turned = here @ rotation_onto(points_m, others_m).T
-    return float(np.linalg.norm(turned - there, axis=1).max())
+    """Return the largest distance between points and others after rotating them onto these."""
+    centred, others = points_m - points_m.mean(axis=0), others_m - others_m.mean(axis=0)
+    rotated = centred @ rotation_onto(points_m, others_m).T
+    return float(np.linalg.norm(rotated - others, axis=1).max())
 
 
 def orient_by_device(
@@ -114,14 +118,14 @@ def orient_by_device(
     *,
     sd_focal: float = 0.0,
 ) -> DevicePose:
-    """Return the camera's pose in the frame of a device, and which point is which.
+    """Return the camera's pose in the frame of a device, and the identity of the image points.
 
     Parameters
     ----------
     points_m : (n, 3) array
         Points of the device; see `require_distinct`.
     pixels : (n, 2) array
-        Their images, in any order.
+        Images of all of them, in any order.
     pixel_cov : (n, 2, 2) array
     sd_focal : float
         Relative standard deviation of the focal length; 0: it is known.
@@ -129,12 +133,12 @@ def orient_by_device(
     Raises
     ------
     NoPoseError
-        If no permutation fits before the camera, the best does not fit well, or the next best fits
-        nearly as well.
+        If no permutation has a pose with all points in front of the camera, the best one does not
+        fit well, or the next best one fits nearly as well.
     """
     starts = _starts(camera, points_m, pixels, sd_focal)
     fits = []
-    for names, start in starts[:_REFINED]:
+    for names, start in starts[:_MAX_REFINED]:
         images = _named(camera, points_m[list(names)], pixels, pixel_cov)
         adjusted = adjusted_pose(camera, images, start, sd_focal)
         if adjusted is not None:
@@ -151,7 +155,7 @@ def orient_by_device(
         raise NoPoseError(
             f"two permutations of the device's points fit alike (margin {margin:.1f})"
         )
-    most_px = max(_MOST_RMS_FLOOR_PX, _MOST_RMS * float(np.linalg.norm(np.ptp(pixels, axis=0))))
+    most_px = max(_MAX_RMS_PX, _MAX_RMS * float(np.linalg.norm(np.ptp(pixels, axis=0))))
     if rms > most_px:
         raise NoPoseError(
             f"the discs do not fit the device (RMS {rms:.2f} px, at most {most_px:.2f}); look at"
@@ -161,7 +165,7 @@ def orient_by_device(
 
 
 def _variance_factor(residuals_px: FloatArray, pixel_cov: FloatArray, unknowns: int) -> float:
-    """Return by how much residuals (n, 2) have larger variances than stated; at least 1."""
+    """Return the variance factor of residuals (n, 2), at least 1."""
     weighted = np.linalg.solve(pixel_cov, residuals_px[..., None])[..., 0]
     return max(1.0, float(np.sum(residuals_px * weighted)) / (residuals_px.size - unknowns))
 
@@ -178,7 +182,7 @@ def _named(
 def _starts(
     camera: Camera, points_m: FloatArray, pixels: FloatArray, sd_focal: float
 ) -> list[tuple[tuple[int, ...], CameraPose]]:
-    """Return permutations (device's point of each image point) with a pose, likely ones first."""
+    """Return permutations (the device's point of each image point) with a pose, best ones first."""
     count = len(pixels)
     triple = _widest(pixels)
     others = [i for i in range(count) if i not in triple]
@@ -190,8 +194,8 @@ def _starts(
         projected = pose.focal_scale * in_camera[:, :2] / in_camera[:, 2:]
         gaps = projected[:, None] - camera.undistort(pixels)[others]
         costs = np.sum(gaps**2, axis=2) / pose.focal_scale
-        left = [i for i in range(count) if i not in chosen]
-        for order in itertools.permutations(left):
+        unassigned = [i for i in range(count) if i not in chosen]
+        for order in itertools.permutations(unassigned):
             names = np.empty(count, dtype=np.intp)
             names[triple], names[others] = chosen, order
             key = tuple(names.tolist())
@@ -205,8 +209,8 @@ def _starts(
 def _poses_of_triple(
     camera: Camera, points_m: FloatArray, pixels: FloatArray, sd_focal: float
 ) -> Iterator[tuple[tuple[int, ...], CameraPose]]:
-    """Yield the poses in which ordered threes of the device are seen at three pixels (3, 2)."""
-    focals = [math.exp(sd_focal * step) for step in _FOCALS] if sd_focal else [1.0]
+    """Yield ordered triples of the device's points with poses that image them at pixels (3, 2)."""
+    focals = [math.exp(sd_focal * step) for step in _FOCAL_SIGMAS] if sd_focal else [1.0]
     for focal in focals:
         rays = camera.undistort(pixels) / focal
         for chosen in itertools.permutations(range(len(points_m)), 3):

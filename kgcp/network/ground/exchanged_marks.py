@@ -1,4 +1,4 @@
-"""Marks in a frame that carry each other's names."""
+"""Marks in a frame whose names are exchanged."""
 
 from __future__ import annotations
 
@@ -17,27 +17,28 @@ from kgcp.network.ground.point_images import CameraPose, PointImages, Readout
 from kgcp.network.ground.pose_adjustment import adjusted_pose
 from kgcp.network.ground.pose_hypotheses import three_point_poses
 
-_MOST_TRIPLES = 6  # that poses start from: one with right names is enough
-_NAMED_TRIPLES = 3  # of these, that get any names: one that is not nearly in a line is enough
-_START_SHARE = 0.1  # of the frame's width, that marks may be off a pose from three of them
-_LIKELY_CHI2 = 25.0  # of a mark, in the mean, at most
-_DOWN_SD_DEG = 10.0  # how far the axis of a camera that looks down is off the vertical
-_SIGMAS = 4.0  # that one of three marks may be displaced by
+_MAX_TRIPLES = 6  # triples of marks from which poses start; one with right names is enough
+# Triples of marks to which all names are given in turn; one that is not nearly in a line is enough.
+_RENAMED_TRIPLES = 3
+_START_SHARE = 0.1  # residual allowed at a pose from three marks, relative to the frame's width
+_MAX_MEAN_CHI2 = 25.0  # χ² per mark at which a pose is accepted
+_TILT_SD_DEG = 10.0  # standard deviation of the camera axis about the vertical
+_DISPLACEMENT_SIGMAS = 4.0  # displacement of one of three marks that is allowed for
 
 
 def exchanged_marks(
     places: Mapping[str, MarkedPlace], positions: Mapping[str, TargetPosition], camera: Camera
 ) -> tuple[str, ...] | None:
-    """Return the targets whose marks carry each other's names, as all marks of a frame say it.
+    """Return the targets whose marks in a frame have exchanged names; None if there are none.
 
-    No camera above the targets can see them as they are marked, and one can with these names
-    exchanged. Three marks at least tell: exchanged names turn the sense in which they follow each
-    other. Three that are nearly in a line do not.
+    Names are exchanged if no camera above the targets can see them as marked, but can see them with
+    these names exchanged. At least three marks are needed: exchanging two of three reverses their
+    sense of rotation. Three marks nearly in a line do not show it.
 
     Parameters
     ----------
     positions : mapping of str to TargetPosition
-        Of the marked targets at least, in the ENU frame.
+        Positions of at least the marked targets in the ENU frame.
     """
     names = [*places]
     if len(names) < 3:
@@ -61,17 +62,20 @@ def exchanged_marks(
 
 
 def _orders(camera: Camera, images: PointImages) -> list[list[int]]:
-    """Return which mark each target may be, where three marks with any names put the camera."""
+    """Return possible assignments: for each one, the number of every target's mark.
+
+    Three marks with any names give poses; the targets projected there are assigned to the marks.
+    """
     rays, count = camera.undistort(images.pixels), len(images)
     orders = set()
-    for triple, named in product(_triples(count)[:_NAMED_TRIPLES], permutations(range(count), 3)):
+    for triple, named in product(_triples(count)[:_RENAMED_TRIPLES], permutations(range(count), 3)):
         for pose in three_point_poses(images.positions_m[list(named)], rays[triple]):
             points_m = pose.in_camera(images.positions_m)
             if np.any(points_m[:, 2] <= 0.0):
                 continue
-            off_px = np.abs(camera.project(points_m)[:, None] - images.pixels).max(axis=2)
-            targets, marks = linear_sum_assignment(off_px)
-            if off_px[targets, marks].max() < _START_SHARE * camera.width:
+            gaps_px = np.abs(camera.project(points_m)[:, None] - images.pixels).max(axis=2)
+            targets, marks = linear_sum_assignment(gaps_px)
+            if gaps_px[targets, marks].max() < _START_SHARE * camera.width:
                 orders.add(tuple(marks.tolist()))
     return [[*order] for order in sorted(orders)]
 
@@ -94,48 +98,54 @@ def _point_images(
 
 
 def _displaced(images: PointImages) -> Iterator[PointImages]:
-    """Yield the marks; of three, which no adjustment smooths, also with one of them displaced."""
+    """Yield the marks as they are and, if there are three, with one of them displaced.
+
+    Three marks determine the pose without redundancy. Displacing them allows for their errors.
+    """
     yield images
     if len(images) > 3:
         return
     for mark, axis in np.ndindex(3, 2):
-        for sigmas in (-_SIGMAS, _SIGMAS):
+        for sigmas in (-_DISPLACEMENT_SIGMAS, _DISPLACEMENT_SIGMAS):
             pixels = images.pixels.copy()
             pixels[mark, axis] += sigmas * math.sqrt(float(images.pixel_cov[mark, axis, axis]))
             yield replace(images, pixels=pixels)
 
 
 def _misfits(camera: Camera, images: PointImages) -> Iterator[float]:
-    """Yield the misfits of poses that see the marks as they are, from above; tilt counts, too."""
+    """Yield the misfit of each acceptable pose: χ² of the marks plus that of the camera's tilt.
+
+    Acceptable poses see the marks from above, and fit them.
+    """
     for start in _starts(camera, images):
         pose, chi2 = start, 0.0
         if len(images) > 3:
             adjusted = adjusted_pose(camera, images, start, 0.0)
             if adjusted is None:
                 continue
-            pose, off_px = adjusted[0], adjusted[2][:, :2]
-            chi2 = float(np.sum(off_px**2 / images.pixel_cov[:, :1, 0]))
+            pose, residuals_px = adjusted[0], adjusted[2][:, :2]
+            chi2 = float(np.sum(residuals_px**2 / images.pixel_cov[:, :1, 0]))
         is_above = bool(np.all(pose.centre_m[2] > images.positions_m[:, 2]))
         down = -float(pose.world_from_camera[2, 2])
-        if is_above and down > 0.0 and chi2 <= _LIKELY_CHI2 * len(images):
+        if is_above and down > 0.0 and chi2 <= _MAX_MEAN_CHI2 * len(images):
             tilt_deg = math.degrees(math.acos(min(1.0, down)))
-            yield chi2 + (tilt_deg / _DOWN_SD_DEG) ** 2
+            yield chi2 + (tilt_deg / _TILT_SD_DEG) ** 2
 
 
 def _starts(camera: Camera, images: PointImages) -> Iterator[CameraPose]:
-    """Yield poses of three marks that the others roughly agree with."""
+    """Yield poses from three marks with which the others roughly agree."""
     rays, count = camera.undistort(images.pixels), len(images)
     for triple in _triples(count):
         for pose in three_point_poses(images.positions_m[triple], rays[triple]):
             points_m = pose.in_camera(images.positions_m)
             if np.any(points_m[:, 2] <= 0.0):
                 continue
-            off_px = camera.project(points_m) - images.pixels
-            if np.max(np.abs(off_px)) < _START_SHARE * camera.width:
+            residuals_px = camera.project(points_m) - images.pixels
+            if np.max(np.abs(residuals_px)) < _START_SHARE * camera.width:
                 yield pose
 
 
 def _triples(count: int) -> list[list[int]]:
-    """Return threes of marks that follow each other."""
-    firsts = range(1 if count == 3 else min(count, _MOST_TRIPLES))
-    return [[(first + each) % count for each in range(3)] for first in firsts]
+    """Return triples of consecutive marks."""
+    firsts = range(1 if count == 3 else min(count, _MAX_TRIPLES))
+    return [[(first + offset) % count for offset in range(3)] for first in firsts]

@@ -15,10 +15,12 @@ from kgcp.network.ground.point_images import CameraPose, PointImages, Readout
 from kgcp.network.ground.resection import NoPoseError, Resection, orient
 from kgcp.targets.fields.points import AnyField
 
-# What discs are off besides their noise, by lens and board: as little as usual, then much. Of more,
-# most discs would be left out as wrongly named.
-_BEYOND_NOISE_PX = (0.05, 0.5)
-_ROUNDS, _SETTLED = 8, 0.05  # of eccentricities and noise; relative change of the noise
+# Errors of the discs beyond their noise, by lens and board: start values, first a usual one, then a
+# large one. If the value is too small, most discs are left out as wrongly named.
+_START_EXTRA_PX = (0.05, 0.5)
+# Rounds of updating eccentricities and extra noise, and the relative change of the noise that ends
+# them.
+_MAX_ROUNDS, _SETTLED = 8, 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,11 +34,11 @@ class FieldPose:
     cov : (6, 6) or (7, 7) array
         As of `Resection`.
     discs, discs_used : int
-        Discs of the field that were measured, and those that agree.
+        Numbers of discs that were measured, and of those that agree.
     rms_px : float
-        Of the residuals of these, per coordinate.
+        RMS of the residuals of the latter, per coordinate.
     radius_scale : float
-        Radii of the discs in the image, over those that the field's diameters have in this pose.
+        Median ratio of the discs' measured radii to those expected from the field's diameters.
     """
 
     pose: CameraPose
@@ -48,7 +50,7 @@ class FieldPose:
 
     @property
     def in_words(self) -> str:
-        """How well it fits."""
+        """The quality of the fit."""
         return f"RMS {self.rms_px:.3f} px, {self.discs_used} of {self.discs} discs"
 
 
@@ -63,15 +65,15 @@ def orient_by_field(
 ) -> FieldPose:
     """Return the camera's pose in the frame of a field.
 
-    Centroids are reduced by their eccentricity, through the lens. How far discs are off beyond
-    their noise is estimated from the residuals.
+    Centroids are corrected for eccentricity, including distortion. Errors of the discs beyond their
+    noise are estimated from the residuals.
 
     Parameters
     ----------
     point : (k,) array
-        Which of the field's discs were measured.
+        Indices of the measured discs in the field.
     moments : (k, 5) array
-        Of their images, as `discs.records.MOMENTS`.
+        Moments of their images, as `discs.records.MOMENTS`.
     covs : (k, 5, 5) array
     has_free_focal : bool
         Whether the focal length is unknown, to a factor of two.
@@ -89,48 +91,49 @@ def orient_by_field(
     images = PointImages(
         positions_m, position_cov, places, place_cov, unknown, unknown, readout=readout
     )
-    found = _first(camera, images, has_free_focal=has_free_focal)
-    beyond_px = math.nan
-    for _ in range(_ROUNDS):
-        pose = found.pose
+    resection = _first(camera, images, has_free_focal=has_free_focal)
+    extra_px = math.nan
+    for _ in range(_MAX_ROUNDS):
+        pose = resection.pose
         circles = Circles3D(pose.in_camera(positions_m), pose.world_from_camera.T @ axes, radii_m)
-        # both grow with the focal length
-        off_px = pose.focal_scale * eccentricity(camera, circles).total_px
-        sizes_px = pose.focal_scale * _sizes_px(circle_images(camera, circles).moments)
-        before_px, beyond_px = beyond_px, _beyond_noise_px(camera, images, found)
-        images = replace(images, pixels=places - off_px)
-        found = _oriented(camera, images, beyond_px, has_free_focal=has_free_focal)
-        if abs(beyond_px - before_px) <= _SETTLED * beyond_px:
+        # eccentricity and size are proportional to the focal length
+        offsets_px = pose.focal_scale * eccentricity(camera, circles).total_px
+        expected_px = pose.focal_scale * _radii_px(circle_images(camera, circles).moments)
+        before_px, extra_px = extra_px, _extra_noise_px(camera, images, resection)
+        images = replace(images, pixels=places - offsets_px)
+        resection = _oriented(camera, images, extra_px, has_free_focal=has_free_focal)
+        if abs(extra_px - before_px) <= _SETTLED * extra_px:
             break
-    if has_free_focal and not math.sqrt(found.cov[6, 6]) <= FOCAL_DETERMINED:
-        sd = 100.0 * math.sqrt(found.cov[6, 6])
+    if has_free_focal and not math.sqrt(resection.cov[6, 6]) <= FOCAL_DETERMINED:
+        sd = 100.0 * math.sqrt(resection.cov[6, 6])
         raise NoPoseError(f"the focal length is not determined (± {sd:.0f} %)")
-    rms_px = float(np.sqrt(np.mean(found.residuals[found.is_used, :2] ** 2)))
-    used = int(np.count_nonzero(found.is_used))
-    radius_scale = float(np.median((_sizes_px(moments) / sizes_px)[found.is_used]))
-    return FieldPose(found.pose, found.cov, len(point), used, rms_px, radius_scale)
+    rms_px = float(np.sqrt(np.mean(resection.residuals[resection.is_used, :2] ** 2)))
+    used = int(np.count_nonzero(resection.is_used))
+    radius_scale = float(np.median((_radii_px(moments) / expected_px)[resection.is_used]))
+    return FieldPose(resection.pose, resection.cov, len(point), used, rms_px, radius_scale)
 
 
-def _sizes_px(moments: FloatArray) -> FloatArray:
-    """Return radii (n,) of circles as large as areas with these moments (n, 5)."""
+def _radii_px(moments: FloatArray) -> FloatArray:
+    """Return the radii (n,) of circles with the same area as ellipses with moments (n, 5)."""
     xx, xy, yy = moments[:, 2:].T
     return np.asarray(2.0 * (xx * yy - xy**2) ** 0.25)
 
 
 def _first(camera: Camera, images: PointImages, *, has_free_focal: bool) -> Resection:
+    """Return the resection with the smallest start value of the extra noise that gives one."""
     problem = NoPoseError("")
-    for beyond_px in _BEYOND_NOISE_PX:
+    for extra_px in _START_EXTRA_PX:
         try:
-            return _oriented(camera, images, beyond_px, has_free_focal=has_free_focal)
+            return _oriented(camera, images, extra_px, has_free_focal=has_free_focal)
         except NoPoseError as error:
             problem = error
     raise problem
 
 
 def _oriented(
-    camera: Camera, images: PointImages, beyond_px: float, *, has_free_focal: bool
+    camera: Camera, images: PointImages, extra_px: float, *, has_free_focal: bool
 ) -> Resection:
-    cov = images.pixel_cov + beyond_px**2 * np.eye(2)
+    cov = images.pixel_cov + extra_px**2 * np.eye(2)
     return orient(
         camera,
         replace(images, pixel_cov=cov),
@@ -139,19 +142,21 @@ def _oriented(
     )
 
 
-def _beyond_noise_px(camera: Camera, images: PointImages, found: Resection) -> float:
-    """Return by how much more than their noise the discs that agree are off, per coordinate."""
-    kept = images.chosen(found.is_used)
-    numbers = 2 * len(kept)
-    # what the unknowns have not taken up of the squares
-    share = max(1.0 - len(found.cov) / numbers, 0.1)
-    off2 = float(np.sum(found.residuals[found.is_used, :2] ** 2)) / share
-    stated2 = float(np.trace(kept.pixel_cov.sum(axis=0))) + _by_positions(camera, kept, found.pose)
-    return math.sqrt(max(off2 - stated2, 0.0) / numbers)
+def _extra_noise_px(camera: Camera, images: PointImages, resection: Resection) -> float:
+    """Return the error of the agreeing discs beyond their stated noise, per coordinate [px]."""
+    kept = images.chosen(resection.is_used)
+    count = 2 * len(kept)
+    # the share of the squared errors that remains in the residuals
+    share = max(1.0 - len(resection.cov) / count, 0.1)
+    squares_px2 = float(np.sum(resection.residuals[resection.is_used, :2] ** 2)) / share
+    stated_px2 = float(np.trace(kept.pixel_cov.sum(axis=0))) + _by_positions(
+        camera, kept, resection.pose
+    )
+    return math.sqrt(max(squares_px2 - stated_px2, 0.0) / count)
 
 
 def _by_positions(camera: Camera, images: PointImages, pose: CameraPose) -> float:
-    """Return the variances in the image, summed, that the points' positions account for [px²]."""
+    """Return the sum of the variances in the image that the points' positions cause [px²]."""
     distance_m = np.linalg.norm(pose.in_camera(images.positions_m), axis=1)
     scale = pose.focal_scale * camera.mean_focal_px / distance_m
     across_m2 = 2.0 / 3.0 * np.trace(images.position_cov, axis1=1, axis2=2)

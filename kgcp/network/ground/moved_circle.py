@@ -1,4 +1,4 @@
-"""Circles that were moved while they were photographed: frames before and after show two places."""
+"""Detection of circles that were moved during a flight: frames before and after show two places."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from kgcp.geometry.circle_image import circle_derivatives
 from kgcp.network.ground.space_circle import CircleViews, SpaceCircle
 
 LEAST_SIDE = 3
-"""Frames before and after a move, at least: fewer are left out as if they showed something else."""
+"""Least number of frames before and after a move. Fewer are rejected as outliers instead."""
 
-_CHANCE = 1e-5  # that frames of one place seem to show two
-_CAPPED_CHI2 = 100.0  # of a frame's place: what is further off tells nothing more
+_FALSE_ALARM = 1e-5  # probability that the frames of one place seem to show two
+_MAX_CHI2 = 100.0  # limit of the χ² of a frame's place, so that outliers do not dominate
 _MEDIAN_CHI2 = 1.386  # of two numbers
 _ROUNDS = 8
-_COARSE = 24  # splits that are tried first
+_COARSE_COUNT = 24  # splits that are tried before the search is refined
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,11 +29,12 @@ class Split:
     Attributes
     ----------
     first : int
-        The first frame of the second place.
+        The first frame that shows the second place.
     off_m : (3,) array
-        From the first to the second place.
+        Vector from the first to the second place.
     gain : float
-        Decrease of χ² by the second place, over what it exceeds by chance once in 100 000 circles.
+        Decrease of χ² by a second place, relative to the decrease that chance exceeds once in
+        100 000 circles.
     """
 
     first: int
@@ -41,7 +42,7 @@ class Split:
     gain: float
 
     def larger_side(self, count: int) -> BoolArray:
-        """Return which of n frames show the place that more of them show, at least half."""
+        """Return which of `count` frames are on the side of the split with more frames."""
         after = np.arange(count) >= self.first
         return after if 2 * np.count_nonzero(after) > count else ~after
 
@@ -49,16 +50,16 @@ class Split:
 def best_split(
     camera: Camera, views: CircleViews, circle: SpaceCircle, covs: FloatArray
 ) -> Split | None:
-    """Return the split of the frames by which two places explain them best; None: too few frames.
+    """Return the split of the frames that two places explain best; None: too few frames.
 
     Parameters
     ----------
     views : CircleViews
         In the order in which they were taken.
     circle : SpaceCircle
-        Near one of the two places, or between them.
+        Close to one of the two places, or between them.
     covs : (n, 2, 2) array
-        Of the places in the images, but for a common factor.
+        Covariances of the places in the images, up to a common factor.
     """
     count = len(views)
     circles = circle.in_cameras(views)
@@ -80,22 +81,22 @@ def best_split(
     def misfit(first: int) -> float:
         return float(np.sum(norms(first)))
 
-    stride = max(1, len(splits) // _COARSE)
+    stride = max(1, len(splits) // _COARSE_COUNT)
     coarse = splits.index(min(splits[::stride], key=misfit))
     first = min(splits[max(0, coarse - stride) : coarse + stride + 1], key=misfit)
     off_m = (
         _place(residuals[first:], design[first:])[0] - _place(residuals[:first], design[:first])[0]
     )
-    two, one = norms(first) ** 2, _place(residuals, design)[1] ** 2
-    # six of the 2 n numbers are adjusted
-    variance = max(1.0, float(np.median(two)) / _MEDIAN_CHI2 * count / (count - 3.0))
-    gain = float(np.sum(_capped(one / variance) - _capped(two / variance)))
-    by_chance = 3.0 * float(fdtri(3, 2 * count - 6, 1.0 - _CHANCE))
+    split_chi2, single_chi2 = norms(first) ** 2, _place(residuals, design)[1] ** 2
+    # two places are six unknowns of 2 n observations
+    variance = max(1.0, float(np.median(split_chi2)) / _MEDIAN_CHI2 * count / (count - 3.0))
+    gain = float(np.sum(_limited(single_chi2 / variance) - _limited(split_chi2 / variance)))
+    by_chance = 3.0 * float(fdtri(3, 2 * count - 6, 1.0 - _FALSE_ALARM))
     return Split(first, off_m, gain / by_chance)
 
 
 def _place(residuals: FloatArray, design: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the shift (3,) with the least sum of residuals' norms, and these (n,)."""
+    """Return the shift (3,) with the least sum of the residuals' norms, and these norms (n,)."""
     weights = np.ones(len(residuals))
     for _ in range(_ROUNDS):
         normal = np.einsum("n,nij,nik->jk", weights, design, design)
@@ -106,5 +107,5 @@ def _place(residuals: FloatArray, design: FloatArray) -> tuple[FloatArray, Float
     return shift, norms
 
 
-def _capped(chi2: FloatArray) -> FloatArray:
-    return np.minimum(chi2, _CAPPED_CHI2)
+def _limited(chi2: FloatArray) -> FloatArray:
+    return np.minimum(chi2, _MAX_CHI2)

@@ -15,28 +15,28 @@ from kgcp.measurement.plate_prior import SceneRotation
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Readout:
-    """When a rolling shutter exposes n points, and how the scene turns meanwhile."""
+    """Exposure times of n points by a rolling shutter, and the rotation of the scene meanwhile."""
 
-    delay_s: FloatArray  # (n,): after the middle row, which is the moment of the pose
+    delay_s: FloatArray  # (n,): after the middle row, to whose moment the pose refers
     rotation: SceneRotation
 
     @classmethod
     def of(
         cls, camera: Camera, pixels: FloatArray, rotation: SceneRotation | None = None
     ) -> Readout | None:
-        """Return that of points at raw pixels (n, 2); None: all are exposed at once.
+        """Return the readout of points at raw pixels (n, 2); None: all are exposed at once.
 
         Parameters
         ----------
         rotation : SceneRotation, optional
-            What is known of it; by default what the camera's settings say.
+            The scene's rotation if it is known; by default that of the camera's settings.
         """
         if not camera.readout_s:
             return None
         return cls(camera.delay_s(pixels), rotation or SceneRotation.unknown(camera))
 
     def chosen(self, which: BoolArray) -> Readout:
-        """Return that of some of the points."""
+        """Return the readout of some of the points."""
         return Readout(self.delay_s[which], self.rotation)
 
 
@@ -45,12 +45,13 @@ class PointImages:
     """n points of known position in one frame."""
 
     positions_m: FloatArray  # (n, 3): in a Cartesian frame, called the world
-    position_cov: FloatArray  # (n, 3, 3): zeros: exact
+    position_cov: FloatArray  # (n, 3, 3); zeros: exact
     pixels: FloatArray  # (n, 2): images of the points, raw pixels
     pixel_cov: FloatArray  # (n, 2, 2)
-    distances_m: FloatArray  # (n,): camera to point, as the image's size says; NaN: not known
+    distances_m: FloatArray  # (n,): camera to point, from the size of its image; NaN: unknown
     sd_distances_m: FloatArray  # (n,)
-    # of the logarithm of what all distances are off by alike: prints, focal length; 0: nothing
+    # standard deviation of the logarithm of the distances' common scale, by prints and focal
+    # length; 0: the scale is exact
     sd_scale: float = 0.0
     readout: Readout | None = None  # None: all points are exposed at the moment of the pose
 
@@ -72,7 +73,7 @@ class PointImages:
 
     @property
     def motion_sd_rad(self) -> FloatArray:
-        """By how much each point may have turned (n,) since the moment of the pose."""
+        """Typical rotation (n,) of each point since the moment of the pose [rad]."""
         if self.readout is None:
             return np.zeros(len(self))
         velocity = np.array(self.readout.rotation.velocity_rad_s)
@@ -100,5 +101,5 @@ class CameraPose:
         return CameraPose(self.centre_m + step[:3], turn @ self.world_from_camera, scale)
 
     def in_camera(self, points_m: FloatArray) -> FloatArray:
-        """Bring points (n, 3) of the world into the camera frame."""
+        """Transform points (n, 3) from the world to the camera frame."""
         return (points_m - self.centre_m) @ self.world_from_camera

@@ -1,8 +1,8 @@
 """The pose of one frame by least squares, with its covariance.
 
-Some errors are those of all points together: distances may be too long by one factor (prints, focal
-length), and a rolling shutter's camera moves from row to row. They are unknowns with an a-priori
-deviation, and are eliminated.
+Some errors are common to all points: distances may have a wrong scale (prints, focal length), and
+with a rolling shutter, the camera moves from row to row. These common errors are unknowns with
+a-priori standard deviations, and are eliminated.
 """
 
 from __future__ import annotations
@@ -19,31 +19,32 @@ from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.camera import Camera
 from kgcp.network.ground.point_images import CameraPose, PointImages
 
-MOST_STEPS = 40
-"""Of an adjustment."""
+MAX_STEPS = 40
+"""Steps of an adjustment."""
 
-_CONVERGED = 1e-5  # decrease of χ² that means nothing
-_HIDDEN_BY_ROUNDING = 1e-9  # … and one that need not be tried
-_ENDS_SD, _LEAST_RISE = 3.0, 0.5  # where a bend ends, and how much of χ² must rise until there
-_NO_DISTANCE = 1e6  # deviation of the logarithm of a distance that is not measured
-_DOUBTED_CHI2 = 9.0  # of a point that counts half for what all points have in common
-_COMMON_ROUNDS = 5  # of its reweighting
-_LEAST_MOTION_RAD_S = (
-    1e-6  # of the deviation of a motion: 0, as a file may state it, has no inverse
-)
+_CONVERGED = 1e-5  # decrease of χ² at which the iteration ends
+_ROUNDING = 1e-9  # expected decrease of χ² below which no step is tried
+# The curve of likely poses is followed to so many standard deviations on either side. At its ends,
+# χ² must have risen by at least this share of the rise that the covariance predicts.
+_CURVE_END_SD, _MIN_RISE = 3.0, 0.5
+_NO_DISTANCE_SD = 1e6  # standard deviation of the logarithm of a distance that is not measured
+_HALF_WEIGHT_CHI2 = 9.0  # χ² of a point that has weight 1/2 in the common errors
+_COMMON_ROUNDS = 5  # rounds of reweighting for the common errors
+# Lower limit of a rotation rate's standard deviation. A file may state 0, which has no inverse.
+_MIN_MOTION_SD_RAD_S = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Linearised:
     """Observations of n points near a pose."""
 
-    # (n, 3): observed minus computed places [px] and logarithms of distances, NaN where they are
-    # not measured; what is known of the camera's motion is taken off
+    # (n, 3): observed minus computed places [px] and logarithms of distances (NaN: not measured),
+    # corrected for the known motion of the camera
     residuals: FloatArray
     design: FloatArray  # (n, 3, 7): derivatives by the pose's step
-    by_point: FloatArray  # (n, 3, 3): … by the points' positions
-    common: FloatArray  # (n, 3, k): … by what all points have in common
-    precisions: FloatArray  # (k,): inverse a-priori variances of that
+    by_point: FloatArray  # (n, 3, 3): derivatives by the points' positions
+    common: FloatArray  # (n, 3, k): derivatives by the common errors
+    precisions: FloatArray  # (k,): inverse a-priori variances of the common errors
 
 
 def _linearised(camera: Camera, images: PointImages, pose: CameraPose) -> _Linearised:
@@ -57,16 +58,16 @@ def _linearised(camera: Camera, images: PointImages, pose: CameraPose) -> _Linea
         parts.append(of_distance)
         sds += [images.sd_scale]
     if images.readout is not None:
-        # the camera moves on from its pose: a shift and a turn, each in proportion to the delay
+        # relative to its pose, the camera has moved and rotated in proportion to the delay
         by_motion = images.readout.delay_s[:, None, None] * design[:, :, :6]
         parts.append(by_motion)
         rotation = images.readout.rotation
         sight_m = np.linalg.norm(images.positions_m - pose.centre_m, axis=1)
-        sd_rad_s = max(rotation.sd_rad_s, _LEAST_MOTION_RAD_S)
+        sd_rad_s = max(rotation.sd_rad_s, _MIN_MOTION_SD_RAD_S)
         sds += [sd_rad_s * float(sight_m.mean())] * 3 + [sd_rad_s] * 3
-        # where the scene turns one way, the camera turns the other way
-        turn = -pose.world_from_camera @ np.array(rotation.velocity_rad_s)
-        residuals = residuals - by_motion[:, :, 3:] @ turn
+        # the camera rotates opposite to the scene
+        camera_rad_s = -pose.world_from_camera @ np.array(rotation.velocity_rad_s)
+        residuals = residuals - by_motion[:, :, 3:] @ camera_rad_s
     common = np.concatenate(parts, axis=2) if parts else np.zeros((len(images), 3, 0))
     return _Linearised(residuals, design, by_point, common, np.array(sds) ** -2.0)
 
@@ -90,7 +91,7 @@ def _residuals(camera: Camera, images: PointImages, pose: CameraPose) -> FloatAr
 def _design(camera: Camera, images: PointImages, pose: CameraPose) -> tuple[FloatArray, FloatArray]:
     """Return derivatives (n, 3, 7) by the pose's step and (n, 3, 3) by the points' positions.
 
-    A distance by an image's size grows with the focal length; it belongs to the camera's own.
+    A measured distance is proportional to the focal length; it was computed with the camera's own.
     """
     points = pose.in_camera(images.positions_m)
     normalised = pose.focal_scale * points[:, :2] / points[:, 2:]
@@ -111,21 +112,21 @@ def _design(camera: Camera, images: PointImages, pose: CameraPose) -> tuple[Floa
 
 
 def _covariances(images: PointImages, by_point: FloatArray) -> FloatArray:
-    """Return the covariances (n, 3, 3) of the observations, those of the positions included."""
+    """Return the covariances (n, 3, 3) of the observations, including those of the positions."""
     cov = by_point @ images.position_cov @ np.swapaxes(by_point, 1, 2)
     cov[:, :2, :2] += images.pixel_cov
     known = images.has_distance
     cov[~known, 2, :] = cov[~known, :, 2] = 0.0
     cov[known, 2, 2] += (images.sd_distances_m[known] / images.distances_m[known]) ** 2
-    cov[~known, 2, 2] = _NO_DISTANCE**2
+    cov[~known, 2, 2] = _NO_DISTANCE_SD**2
     return np.asarray(cov)
 
 
 def _chi2(residuals: FloatArray, cov: FloatArray) -> FloatArray:
-    """Return squared residuals (n,) over covariances; infinite behind the camera."""
+    """Return the χ² (n,) of points; infinite behind the camera."""
     behind = ~np.isfinite(residuals[:, 0])
-    known = np.nan_to_num(residuals)
-    squares = np.einsum("nm,nm->n", known, np.linalg.solve(cov, known[..., None])[..., 0])
+    measured = np.nan_to_num(residuals)
+    squares = np.einsum("nm,nm->n", measured, np.linalg.solve(cov, measured[..., None])[..., 0])
     return np.asarray(np.where(behind, np.inf, squares))
 
 
@@ -137,14 +138,14 @@ def adjusted_pose(
     Parameters
     ----------
     start : CameraPose
-        Near enough that all points lie in front of the camera.
+        Approximate pose; all points must lie in front of the camera.
     sd_focal : float
         As for `orient`.
 
     Returns
     -------
     tuple or None
-        None: a point falls behind the camera, or the pose is not determined.
+        None if a point falls behind the camera, or the pose is not determined.
     """
     used = np.ones(len(images), dtype=np.bool_)
     pose = minimised(camera, images, start, used.astype(np.float64), sd_focal)
@@ -159,12 +160,12 @@ def adjusted_pose(
 def squared_residuals(
     camera: Camera, images: PointImages, pose: CameraPose, slack_px: float
 ) -> FloatArray:
-    """Return squared residuals (n,) over their covariances; infinite behind the camera.
+    """Return the χ² (n,) of points; infinite behind the camera.
 
     Parameters
     ----------
     slack_px : float
-        By which places may be off besides.
+        Additional standard deviation of the places.
     """
     ahead = _is_ahead(images, pose)
     chi2 = np.full(len(images), np.inf)
@@ -173,7 +174,7 @@ def squared_residuals(
         near = _linearised(camera, kept, pose)
         cov = _covariances(kept, near.by_point)
         cov[:, :2, :2] += slack_px**2 * np.eye(2)
-        chi2[ahead] = _chi2(near.residuals - near.common @ _in_common(kept, near, cov), cov)
+        chi2[ahead] = _chi2(near.residuals - near.common @ _estimated_common(kept, near, cov), cov)
     return chi2
 
 
@@ -188,7 +189,7 @@ def minimised(
     start: CameraPose,
     weights: FloatArray,
     sd_focal: float,
-    most_steps: int = MOST_STEPS,
+    max_steps: int = MAX_STEPS,
     within: FloatArray | None = None,
 ) -> CameraPose | None:
     """Return the pose with the least weighted squares; None if a point falls behind the camera.
@@ -196,24 +197,24 @@ def minimised(
     Parameters
     ----------
     within : (6, k) or (7, k) array, optional
-        Directions that steps may take; by default all.
+        Directions to which steps are limited; by default all are allowed.
     """
-    counted = weights > 1e-9
-    kept, weight = images.chosen(counted), weights[counted]
-    if np.count_nonzero(counted) < 3:
+    is_weighted = weights > 1e-9
+    kept, weight = images.chosen(is_weighted), weights[is_weighted]
+    if np.count_nonzero(is_weighted) < 3:
         return None
     pose, damping = start, 1e-6
     normal, right, cost = _normal_equations(camera, kept, pose, weight, sd_focal)
     if not math.isfinite(cost):
         return None
     basis = np.eye(len(normal)) if within is None else within
-    for _ in range(most_steps):
+    for _ in range(max_steps):
         scaled = basis / np.sqrt(np.maximum(np.diag(basis.T @ normal @ basis), 1e-300))
         unit = scaled.T @ normal @ scaled
         while True:
             damped = unit + damping * np.eye(len(unit))
             step = scaled @ np.linalg.solve(damped, scaled.T @ right)
-            if float(step @ right) <= _HIDDEN_BY_ROUNDING:  # no step gains more
+            if float(step @ right) <= _ROUNDING:
                 return pose
             trial = pose.moved(step)
             trial_normal, trial_right, trial_cost = _normal_equations(
@@ -239,73 +240,76 @@ def _normal_equations(
     weights: FloatArray,
     sd_focal: float,
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Return normal matrix, right-hand side and weighted squares; the focal length if unknown."""
+    """Return normal matrix, right-hand side and weighted squares of the pose.
+
+    The focal length is among the unknowns if it has a standard deviation.
+    """
     unknowns = 7 if sd_focal else 6
     if not _is_ahead(images, pose).all():
         return np.eye(unknowns), np.zeros(unknowns), math.inf
     near = _linearised(camera, images, pose)
-    known = np.nan_to_num(near.residuals)[..., None]
-    both = np.concatenate((near.design[:, :, :unknowns], known, near.common), axis=2)
+    measured = np.nan_to_num(near.residuals)[..., None]
+    rows = np.concatenate((near.design[:, :, :unknowns], measured, near.common), axis=2)
     cov = _covariances(images, near.by_point)
     try:
-        weighted = weights[:, None, None] * np.linalg.solve(cov, both)
-    except np.linalg.LinAlgError:  # a step to where a point is in the camera
+        weighted = weights[:, None, None] * np.linalg.solve(cov, rows)
+    except np.linalg.LinAlgError:  # the step put a point into the projection centre
         return np.eye(unknowns), np.zeros(unknowns), math.inf
-    square = np.einsum("nmp,nmq->pq", both, weighted)
+    square = np.einsum("nmp,nmq->pq", rows, weighted)
     square = _without_common(square, near.precisions)
     normal, right = square[:unknowns, :unknowns], square[:unknowns, unknowns]
     cost = float(square[unknowns, unknowns])
     if sd_focal:
-        off = math.log(pose.focal_scale)
+        log_scale = math.log(pose.focal_scale)
         normal[6, 6] += 1.0 / sd_focal**2
-        right[6] -= off / sd_focal**2
-        cost += (off / sd_focal) ** 2
+        right[6] -= log_scale / sd_focal**2
+        cost += (log_scale / sd_focal) ** 2
     return normal, right, cost
 
 
 def _without_common(square: FloatArray, precisions: FloatArray) -> FloatArray:
-    """Return products of columns without the last k, which are unknowns that are eliminated."""
+    """Eliminate the last k unknowns from a matrix of products of columns (Schur complement)."""
     kept = len(square) - len(precisions)
-    own = square[kept:, kept:] + np.diag(precisions)
+    normal = square[kept:, kept:] + np.diag(precisions)
     return np.asarray(
-        square[:kept, :kept] - square[:kept, kept:] @ np.linalg.solve(own, square[kept:, :kept])
+        square[:kept, :kept] - square[:kept, kept:] @ np.linalg.solve(normal, square[kept:, :kept])
     )
 
 
 def position_equations(
     camera: Camera, images: PointImages, pose: CameraPose, sd_focal: float
 ) -> tuple[FloatArray, FloatArray, float] | None:
-    """Return normal equations of corrections to the points' positions, the pose eliminated.
+    """Return normal equations of corrections to the points' positions, with the pose eliminated.
 
     Parameters
     ----------
     images : PointImages
-        Their `position_cov` does not count.
+        Their `position_cov` is ignored.
     pose : CameraPose
-        Near the right one.
+        Approximate pose.
     sd_focal : float
         As for `orient`.
 
     Returns
     -------
     normal : (3 n, 3 n) array
-        Singular: the whole can be shifted and turned.
+        Singular, because all points together can be shifted and rotated.
     right : (3 n,) array
     squares : float
-        Weighted squares of the residuals, without corrections.
-        None instead of the three: a point is behind the camera, or the pose is not determined.
+        Weighted squares of the residuals without corrections.
+        None instead of all three if a point is behind the camera, or the pose is not determined.
     """
     if not _is_ahead(images, pose).all():
         return None
     near = _linearised(camera, images, pose)
     exact = replace(images, position_cov=np.zeros_like(images.position_cov))
     unknowns = 7 if sd_focal else 6
-    off = np.nan_to_num(near.residuals)[..., None]
-    both = np.concatenate(
-        (_by_positions(near), off, near.design[:, :, :unknowns], near.common), axis=2
+    measured = np.nan_to_num(near.residuals)[..., None]
+    rows = np.concatenate(
+        (_by_positions(near), measured, near.design[:, :, :unknowns], near.common), axis=2
     )
     square = np.einsum(
-        "nmp,nmq->pq", both, np.linalg.solve(_covariances(exact, near.by_point), both)
+        "nmp,nmq->pq", rows, np.linalg.solve(_covariances(exact, near.by_point), rows)
     )
     of_pose = np.zeros(unknowns)
     if sd_focal:
@@ -328,18 +332,18 @@ def _by_positions(near: _Linearised) -> FloatArray:
 def position_slopes(
     camera: Camera, images: PointImages, pose: CameraPose, sd_focal: float
 ) -> FloatArray:
-    """Return how an adjusted pose follows its points' positions.
+    """Return the derivatives of an adjusted pose by its points' positions.
 
     Returns
     -------
     (6, n, 3) or (7, n, 3) array
-        Derivatives of the pose's step by the positions.
+        Derivatives of the pose's step.
     """
     near = _linearised(camera, images, pose)
     unknowns = 7 if sd_focal else 6
-    both = np.concatenate((near.design[:, :, :unknowns], -_by_positions(near), near.common), axis=2)
-    weighted = np.linalg.solve(_covariances(images, near.by_point), both)
-    reduced = _without_common(np.einsum("nmp,nmq->pq", both, weighted), near.precisions)
+    rows = np.concatenate((near.design[:, :, :unknowns], -_by_positions(near), near.common), axis=2)
+    weighted = np.linalg.solve(_covariances(images, near.by_point), rows)
+    reduced = _without_common(np.einsum("nmp,nmq->pq", rows, weighted), near.precisions)
     normal, by_positions = reduced[:unknowns, :unknowns], reduced[:unknowns, unknowns:]
     if sd_focal:
         normal[6, 6] += 1.0 / sd_focal**2
@@ -347,25 +351,27 @@ def position_slopes(
 
 
 def scale_at(camera: Camera, images: PointImages, pose: CameraPose) -> float:
-    """Return the logarithm of what all distances are too long by, alike; 0: they are not."""
-    return float(common_at(camera, images, pose)[0][0]) if images.sd_scale else 0.0
+    """Return the logarithm of the factor by which all distances are too long; 0: not estimated."""
+    return float(common_errors(camera, images, pose)[0][0]) if images.sd_scale else 0.0
 
 
-def common_at(camera: Camera, images: PointImages, pose: CameraPose) -> tuple[FloatArray, float]:
-    """Return what all points have in common (k,), and its squares over a-priori variances.
+def common_errors(
+    camera: Camera, images: PointImages, pose: CameraPose
+) -> tuple[FloatArray, float]:
+    """Return the common errors (k,) of all points, and their χ² by a-priori variances.
 
-    First what all distances are too long by, if that is unknown; then how the camera moves during
-    the readout, if that is.
+    They are the logarithm of the distances' scale, if it is unknown, and the camera's motion during
+    the readout, if it is unknown.
     """
     near = _linearised(camera, images, pose)
-    amounts = _in_common(images, near, _covariances(images, near.by_point))
+    amounts = _estimated_common(images, near, _covariances(images, near.by_point))
     return amounts, float(near.precisions @ amounts**2)
 
 
-def _in_common(images: PointImages, near: _Linearised, cov: FloatArray) -> FloatArray:
-    """Return what all points have in common (k,), from their residuals.
+def _estimated_common(images: PointImages, near: _Linearised, cov: FloatArray) -> FloatArray:
+    """Return the common errors (k,) of all points from their residuals.
 
-    Points with wrong names hardly count.
+    The estimate is robust: points with wrong names hardly count.
     """
     scale = [_scale(images, near.residuals, cov)] if images.sd_scale else []
     amounts = np.zeros(len(near.precisions))
@@ -380,32 +386,32 @@ def _in_common(images: PointImages, near: _Linearised, cov: FloatArray) -> Float
     products = np.swapaxes(near.common, 1, 2) @ np.linalg.solve(cov, both)
     for stated in (wide, *[cov] * _COMMON_ROUNDS):
         chi2 = _chi2(near.residuals - near.common @ amounts, stated)
-        weights = 1.0 / (1.0 + chi2 / _DOUBTED_CHI2)
+        weights = 1.0 / (1.0 + chi2 / _HALF_WEIGHT_CHI2)
         normal = np.einsum("n,npq->pq", weights, products)
         amounts = np.linalg.solve(normal[:, :-1] + np.diag(near.precisions), normal[:, -1])
     return np.asarray(amounts)
 
 
 def _scale(images: PointImages, residuals: FloatArray, cov: FloatArray) -> float:
-    """Return the logarithm by which all distances are too long, from residuals (n, 3).
+    """Return the logarithm of the factor by which all distances are too long.
 
-    Points with wrong names hardly count: residuals far from the median have little weight.
+    Residuals (n, 3) far from the median have little weight, so that wrong names hardly count.
     """
-    known = images.has_distance & np.isfinite(residuals).all(axis=1)
-    if not known.any():
+    is_measured = images.has_distance & np.isfinite(residuals).all(axis=1)
+    if not is_measured.any():
         return 0.0
-    logs, variances = residuals[known, 2], cov[known, 2, 2]
-    off = (logs - np.median(logs)) ** 2 / variances
-    weights = 1.0 / (variances * (1.0 + off / _DOUBTED_CHI2))
+    logs, variances = residuals[is_measured, 2], cov[is_measured, 2, 2]
+    chi2 = (logs - np.median(logs)) ** 2 / variances
+    weights = 1.0 / (variances * (1.0 + chi2 / _HALF_WEIGHT_CHI2))
     return float(weights @ logs / (weights.sum() + images.sd_scale**-2.0))
 
 
 def covariance_and_residuals(
     camera: Camera, images: PointImages, pose: CameraPose, used: BoolArray, sd_focal: float
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Return covariance, residuals and their squares; None: the pose is not determined.
+    """Return covariance, residuals and χ² of a pose; None if it is not determined.
 
-    Residuals are those to the pose and to its motion, but not to what distances are too long by.
+    Residuals are corrected for the motion during the readout, but not for the distances' scale.
     """
     kept = images.chosen(used)
     normal, _, _ = _normal_equations(camera, kept, pose, np.ones(len(kept)), sd_focal)
@@ -418,47 +424,47 @@ def covariance_and_residuals(
     residuals = _residuals(camera, images, pose)
     if images.readout is not None:
         near = _linearised(camera, images, pose)
-        amounts, _ = common_at(camera, kept, pose)
+        amounts, _ = common_errors(camera, kept, pose)
         residuals = near.residuals - near.common[:, :, -6:] @ amounts[-6:]
     return 0.5 * (cov + cov.T), residuals, chi2
 
 
-def bend_cov(
+def second_order_cov(
     camera: Camera, images: PointImages, pose: CameraPose, cov: FloatArray, sd_focal: float
 ) -> FloatArray | None:
-    """Return what a covariance of first order lacks, where one turn is hardly determined.
+    """Return the second-order part of the covariance, if one rotation is hardly determined.
 
-    Poses that are nearly as likely lie along a curve: at t standard deviations of that turn t d +
-    t² q away, in first and second order. With a normal t the mean square of the second part is
-    3 q qᵀ. The curve is followed to ± 3 standard deviations.
+    Likely poses then lie along a curve. At t standard deviations of this rotation, the step from
+    the estimated pose is t d + t² q to second order. If t is normally distributed, the mean square
+    of the second term is 3 q qᵀ. q is found by following the curve to ± 3 standard deviations.
 
     Returns
     -------
     array or None
-        None: at one of its ends there is no pose, or one that fits better than it should, as where
-        the two poses of a plane that is seen from the front run into each other.
+        None if there is no pose at an end of the curve, or if that pose fits too well. This
+        happens where the two poses of a plane seen frontally merge.
     """
     variances, axes = np.linalg.eigh(cov[3:6, 3:6])
     along = np.zeros(len(cov))
     along[3:6] = axes[:, -1]
-    to_end = _ENDS_SD * cov @ along / math.sqrt(variances[-1])
-    held = null_space(along[None])
+    to_end = _CURVE_END_SD * cov @ along / math.sqrt(variances[-1])
+    across = null_space(along[None])
     weights = np.ones(len(images))
     _, _, least = _normal_equations(camera, images, pose, weights, sd_focal)
-    bend = np.zeros(len(cov))
+    curvature = np.zeros(len(cov))
     for step in (to_end, -to_end):
-        there = minimised(camera, images, pose.moved(step), weights, sd_focal, within=held)
-        if there is None:
+        end = minimised(camera, images, pose.moved(step), weights, sd_focal, within=across)
+        if end is None:
             return None
-        _, _, cost = _normal_equations(camera, images, there, weights, sd_focal)
-        if cost - least < _LEAST_RISE * _ENDS_SD**2:
+        _, _, cost = _normal_equations(camera, images, end, weights, sd_focal)
+        if cost - least < _MIN_RISE * _CURVE_END_SD**2:
             return None
-        bend += 0.5 * _step_between(pose, there, len(cov)) / _ENDS_SD**2
-    return 3.0 * np.outer(bend, bend)
+        curvature += 0.5 * _step_between(pose, end, len(cov)) / _CURVE_END_SD**2
+    return 3.0 * np.outer(curvature, curvature)
 
 
 def _step_between(pose: CameraPose, other: CameraPose, unknowns: int) -> FloatArray:
-    """Return the step that moves one pose to another: shift, left rotation, focal length."""
-    turn = Rotation.from_matrix(other.world_from_camera @ pose.world_from_camera.T).as_rotvec()
+    """Return the step from one pose to another: shift, left rotation vector, focal length."""
+    vector = Rotation.from_matrix(other.world_from_camera @ pose.world_from_camera.T).as_rotvec()
     focal = math.log(other.focal_scale / pose.focal_scale)
-    return np.array([*(other.centre_m - pose.centre_m), *turn, focal])[:unknowns]
+    return np.array([*(other.centre_m - pose.centre_m), *vector, focal])[:unknowns]

@@ -1,4 +1,4 @@
-"""Poses of a frame from three points each, by places alone (P3P) or by places and distances."""
+"""Poses of a frame from three points, by their images alone (P3P) or with their distances."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import rotation_about
 from kgcp.network.ground.point_images import CameraPose, PointImages
 
-_MOST_TRIPLES = 200
+_MAX_TRIPLES = 200
 
 
 def hypotheses(
     camera: Camera, images: PointImages, focals: Sequence[float], seed: int
 ) -> Iterator[CameraPose]:
-    """Yield all poses of triples of points, none of them behind the camera."""
+    """Yield all poses from triples of points, with these in front of the camera."""
     triples = _triples(len(images), seed)
     for focal in focals:
         rays = _normalised(camera, images.pixels, focal)
@@ -38,9 +38,10 @@ def hypotheses(
 def _aligned_pose(
     positions_m: FloatArray, rays: FloatArray, distances_m: FloatArray
 ) -> CameraPose | None:
-    """Return the pose in which points (3, 3) best lie at distances along rays; None: in a line.
+    """Return the pose in which points (3, 3) best lie at given distances along rays (3, 2).
 
-    Where noise leaves no exact pose of three points, near their critical cylinder, this is one.
+    Near the critical cylinder of three points, noise may leave no exact pose; this one exists
+    nevertheless. None: the points lie in a line.
     """
     directions = np.column_stack((rays, np.ones(len(rays))))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -52,24 +53,24 @@ def _aligned_pose(
 
 
 def _are_in_line(points: FloatArray) -> bool:
-    """Tell whether three points (3, 3) lie in a line, but for rounding."""
+    """Tell whether three points (3, 3) lie in a line, up to rounding."""
     first, second = points[1] - points[0], points[2] - points[0]
     limit = 1e-9 * float(first @ first + second @ second)
     return not float(np.linalg.norm(np.cross(first, second))) > limit
 
 
 def _triples(count: int, seed: int) -> list[list[int]]:
-    """Return triples of points: all, or some that are drawn."""
-    if math.comb(count, 3) <= _MOST_TRIPLES:
+    """Return all triples of points, or a random choice if there are too many."""
+    if math.comb(count, 3) <= _MAX_TRIPLES:
         return [list(triple) for triple in itertools.combinations(range(count), 3)]
     rng = np.random.default_rng([seed, count])
-    return [sorted(rng.choice(count, 3, replace=False).tolist()) for _ in range(_MOST_TRIPLES)]
+    return [sorted(rng.choice(count, 3, replace=False).tolist()) for _ in range(_MAX_TRIPLES)]
 
 
 def three_point_poses(positions_m: FloatArray, rays: FloatArray) -> Iterator[CameraPose]:
     """Yield the poses, at most four, in which three points (3, 3) lie on rays (3, 2).
 
-    Rays are normalised coordinates. Points behind the camera are no pose.
+    Rays are given by normalised coordinates. All points lie in front of the camera.
     """
     middle = positions_m.mean(axis=0)
     try:
@@ -92,8 +93,8 @@ def three_point_poses(positions_m: FloatArray, rays: FloatArray) -> Iterator[Cam
 
 
 def _normalised(camera: Camera, pixels: FloatArray, focal: float) -> FloatArray:
-    """Return normalised coordinates (n, 2) for a focal length that is a multiple of the camera's.
+    """Return normalised coordinates (n, 2) for `focal` times the camera's focal length.
 
-    The distortion stays where it is in the image.
+    Distortion as a function of the place in the image stays the same.
     """
     return np.asarray(camera.undistort(pixels) / focal)

@@ -1,4 +1,4 @@
-"""A circle in space, and its images in frames whose exterior orientations are known."""
+"""A circle in space, and its images in frames with known exterior orientation."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ class CircleViews:
     world_from_camera: FloatArray  # (n, 3, 3): camera axes in the world, as columns
     # (n, 5): centroid x, y [px] and second moments xx, xy, yy [px²] of the circle's image
     moments: FloatArray
-    cov: FloatArray  # (n, 5, 5): of the moments, without what all frames share
+    cov: FloatArray  # (n, 5, 5): of the moments, without errors that all frames share
     # (n, 6, 6): of the exterior orientations: position [m] and left rotation vector [rad], in the
     # world's axes; None: they are exact
     exterior_cov: FloatArray | None = None
-    # (n, 6, 6): what six independent errors, with a deviation of 1 and alike in all frames, do to
-    # the exterior orientations; they are in `exterior_cov` as well; None: there are none
+    # (n, 6, 6): effects on the exterior orientations of six independent errors that are the same in
+    # all frames, each with standard deviation 1; `exterior_cov` includes them; None: there are none
     common_effects: FloatArray | None = None
 
     def __len__(self) -> int:
@@ -54,10 +54,10 @@ class SpaceCircle:
 
     @property
     def axes(self) -> FloatArray:
-        """Two unit vectors (3, 2) square to the normal, about which its two unknowns turn it.
+        """Two unit vectors (3, 2) perpendicular to the normal: axes of its two unknown rotations.
 
-        The first is the world's x axis, made square to the normal; its y axis, if x is nearer to
-        the normal than 30°.
+        The first is the world's x axis projected into the circle's plane. If the x axis is within
+        30° of the normal, the y axis is taken instead.
         """
         helper = np.eye(3)[int(abs(self.normal[0]) > math.cos(math.radians(30.0)))]
         first = helper - (helper @ self.normal) * self.normal
@@ -65,9 +65,13 @@ class SpaceCircle:
         return np.stack((first, cross_matrix(self.normal) @ first), axis=1)
 
     def moved(self, step: FloatArray) -> SpaceCircle:
-        """Return the circle after a step (6,): centre [m], turn about `axes` [rad], radius [m]."""
-        turn = rotation_about(np.ascontiguousarray(self.axes @ step[3:5]))
-        normal = turn @ self.normal
+        """Return the circle after a step (6,).
+
+        The step is a shift of the centre [m], rotations about `axes` [rad] and a change of the
+        radius [m].
+        """
+        rotation = rotation_about(np.ascontiguousarray(self.axes @ step[3:5]))
+        normal = rotation @ self.normal
         return SpaceCircle(
             self.centre_m + step[:3], normal / np.linalg.norm(normal), self.radius_m + step[5]
         )
@@ -88,16 +92,16 @@ class SpaceCircle:
 
 @dataclass(frozen=True, slots=True)
 class ExtraNoise:
-    """Deviations of the images beyond the stated ones, the same for all circles of a flight.
+    """Noise of the images beyond the stated one, the same for all circles of a flight.
 
-    Both are those of a disc's centre, per coordinate: what noise that is white along the outline
-    does to it. The moments have the part that such noise would have in them.
+    Both standard deviations are those of a centre, per coordinate, under white noise along the
+    outline. `outline_noise` gives the effect of the same noise on the moments.
     """
 
-    centre_px: float = 0.0  # of the places: largely the exterior orientations'
-    outline_px: float = 0.0  # of size and shape: print, light, tone
-    # variance factors of the stated covariances of places and of shapes, where residuals of many
-    # images are smaller than stated
+    centre_px: float = 0.0  # noise of places, mostly by the exterior orientations
+    outline_px: float = 0.0  # noise of size and shape, by print, light and tone
+    # factors of the stated variances of places and shapes; below 1 if residuals of many images are
+    # smaller than stated
     centre_factor: float = 1.0
     outline_factor: float = 1.0
 
@@ -113,7 +117,7 @@ def angle_deg(first: FloatArray, second: FloatArray) -> float:
 
 
 def outline_noise(moments: FloatArray) -> FloatArray:
-    """Return the covariances (n, 5, 5) for white noise of the outline: 1 px² of the centre.
+    """Return the covariances (n, 5, 5) by white noise of the outline that moves centres by 1 px.
 
     An edge displaced by ρ₀ + c cos φ + d sin φ + e cos 2φ + f sin 2φ moves the centre by (c, d) and
     changes the moments of a circle of radius a by ½ a (ρ₀ + e), ½ a f and ½ a (ρ₀ − e). White noise
@@ -127,6 +131,6 @@ def outline_noise(moments: FloatArray) -> FloatArray:
 
 
 def mean_radius(moments: FloatArray) -> FloatArray:
-    """Return the radii (n,) of circles with the area of ellipses with these moments [px]."""
+    """Return the radii (n,) of circles with the same area as ellipses with moments (n, 5) [px]."""
     determinant = moments[:, 2] * moments[:, 4] - moments[:, 3] ** 2
     return np.asarray(2.0 * np.maximum(determinant, 1e-12) ** 0.25)

@@ -1,9 +1,8 @@
 """Static targets placed from all frames with a known orientation, and compared with flight.toml.
 
-Of a coded ring a frame gives the pose, for which its configured diameter was used. What was
-measured is the image: the moments of its outer circle. They do not depend on the diameter, and
-both poses of the circle have nearly the same. So the ring is placed from its moments, and its
-diameter comes out as a check.
+A frame's pose of a coded ring depends on the diameter in flight.toml. The moments of its outer
+circle in the image do not, and they are nearly the same for both poses of the circle. So rings are
+placed from these moments, which are computed from the pose; the diameter is estimated as a check.
 """
 
 from __future__ import annotations
@@ -30,14 +29,17 @@ from kgcp.network.ground.circles_together import MovedCircleError, place_circles
 from kgcp.network.ground.moved_circle import Split
 from kgcp.network.ground.space_circle import CircleViews, ExtraNoise, NoCircleError, SpaceCircle
 from kgcp.network.ground.target_plane import (
-    MOST_EXTRA_PX,
+    MAX_EXTRA_PX,
     PlacedCircle,
     common_covariance,
 )
 from kgcp.targets.plain import AnyTarget, Shape, shape_of
 
-_FLOOR_PX = 0.0005  # of the outline: no print is better, and a frontal view has no singular pose
-_CODED_EDGE_SD_PX = 0.0  # displaced edges are an unknown of every measurement of a coded ring
+# Smallest standard deviation of an outline. No print is better; it also keeps the covariance of a
+# frontal view regular.
+_MIN_OUTLINE_SD_PX = 0.0005
+# Common displacement of edges. It is zero for coded rings: their measurement estimates it.
+_CODED_EDGE_SD_PX = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,11 +51,10 @@ class PlacedTarget:
     target : str
         Name in flight.toml.
     shape : Shape
-        What is on it.
     frames : tuple of str
         All n frames with the target and a known orientation.
     is_used : (n,) array
-        Which of them agree; the others are left out.
+        Whether a frame agrees; the others are left out.
     residuals : (n, 5) array
         Observed minus computed centroid [px] and second moments [px²].
     chi2 : (n,) array
@@ -61,32 +62,33 @@ class PlacedTarget:
     position_map : (3,) array
         Centre x, y, z in the flight's CRS.
     normal : (3,) array
-        Unit vector along the map's axes towards the side from which the target is seen; (0, 0, 1)
-        if it lies level.
+        Unit vector in the map's axes towards the side from which the target is seen; (0, 0, 1) for
+        a level target.
     other_normal : (3,) array or None
-        The mirrored normal that fits nearly as well; None: it leads to the same one.
+        The mirrored normal, adjusted as well; None: that adjustment leads to the same normal.
     ambiguity : float
         Δχ² by which the mirrored normal fits worse.
     diameter_m : float
     cov, common_cov : (6, 6) array
-        x, y, z along the map's axes [m]; turns about two axes square to the normal [rad], of which
-        the first is the map's x made square to it; radius [m]. `cov` has what differs between
-        frames, `common_cov` what all frames share.
+        Covariances of x, y, z in the map's axes [m], of rotations about two axes perpendicular to
+        the normal [rad], and of the radius [m]. The first axis is the map's x axis projected into
+        the target's plane. `cov` is from errors that differ between frames, `common_cov` from
+        errors that all frames share.
     variance_factor : float
-        Squares of the residuals over what was expected.
+        χ² per degree of freedom.
     own_noise_px : float or None
-        How far its images deviate beyond what is stated [px], if by far more than those of most
-        targets; None: they do not. If they do, both covariances together are those of a single
-        frame: more frames do not reduce what may be alike in many.
+        Standard deviation of its images beyond the stated one [px], if it is far larger than that
+        of most targets; None: it is not. If it is, the sum of both covariances is that of a single
+        frame, because such errors may be the same in many frames.
     move : TargetMove or None
-        That it was moved during the flight, and placed by the frames of one place; None: nothing is
-        seen of that.
+        A move of the target during the flight. The target is placed from the frames of one place.
+        None: there are no signs of a move.
     step : TargetMove or None
-        That the reference poses step, or, of a single target, that this or a move of the target
-        shows; it is placed by the frames of both places, and both covariances together are those
-        of a single frame. None: nothing is seen of that.
+        A step of the reference poses; for a single target, this or a move of the target. The target
+        is placed from the frames of both places, and the sum of both covariances is that of a
+        single frame. None: there are no signs of a step.
     check : PlaceCheck
-        Against flight.toml.
+        Comparison with flight.toml.
     """
 
     target: str
@@ -110,12 +112,12 @@ class PlacedTarget:
 
     @property
     def total_cov(self) -> FloatArray:
-        """Both covariances together (6, 6)."""
+        """Sum of both covariances (6, 6)."""
         return np.asarray(self.cov + self.common_cov)
 
     @property
     def sds(self) -> FloatArray:
-        """Standard deviations (6,) by both covariances: x, y, z [m], turns [rad], radius [m]."""
+        """Standard deviations (6,) by `total_cov`: x, y, z [m], rotations [rad], radius [m]."""
         return np.asarray(np.sqrt(np.diag(self.total_cov)))
 
     @property
@@ -125,30 +127,30 @@ class PlacedTarget:
 
     @property
     def tilt_deg(self) -> float:
-        """Angle between normal and vertical [deg]."""
+        """Angle between the normal and the vertical [deg]."""
         return math.degrees(math.atan2(math.hypot(*self.normal[:2]), self.normal[2]))
 
     @property
     def sd_normal_deg(self) -> float:
-        """Standard deviation of the normal about the worse one of its axes [deg]."""
+        """Standard deviation of the normal about its weakest axis [deg]."""
         return math.degrees(math.sqrt(float(np.linalg.eigvalsh(self.total_cov[3:5, 3:5])[-1])))
 
     @property
     def worst_frame(self) -> str:
-        """The frame that fits least."""
+        """The frame with the largest χ²."""
         return self.frames[int(np.argmax(self.chi2))]
 
 
 @dataclass(frozen=True, slots=True)
 class TargetMove:
-    """A target that has two places in a flight."""
+    """An apparent change of a target's place during a flight."""
 
-    frame: str  # the first that shows the second place
-    distance_m: float  # between them, nearly
+    frame: str  # the first frame that shows the second place
+    distance_m: float  # approximate distance between the two places
 
     @property
     def as_move(self) -> str:
-        """The words for a target that did not stay where it was."""
+        """The change in words, as a move of the target."""
         return (
             f"was moved by about {self.distance_m:.2g} m, or others were taken for it: from"
             f" {self.frame} on, its images show another place"
@@ -157,11 +159,11 @@ class TargetMove:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceCheck:
-    """A placed target against what flight.toml says of it."""
+    """Comparison of a placed target with flight.toml."""
 
-    # (3,): placed minus stated, along the map's axes [m]; None: flight.toml states no position
+    # (3,): placed minus stated, in the map's axes [m]; None: flight.toml states no position
     residual_m: FloatArray | None
-    cov_m2: FloatArray | None  # (3, 3): its covariance, that of the stated position included
+    cov_m2: FloatArray | None  # (3, 3): its covariance, including that of the stated position
     stated_diameter_m: float
     diameter_residual_m: float  # placed minus stated
     sd_diameter_residual_m: float
@@ -173,7 +175,7 @@ class PlaceCheck:
 
     @property
     def position_chi2(self) -> float | None:
-        """Squared residual of the place over its covariance; three numbers."""
+        """χ² of the place, of three coordinates."""
         if self.residual_m is None or self.cov_m2 is None:
             return None
         return float(self.residual_m @ np.linalg.solve(self.cov_m2, self.residual_m))
@@ -187,10 +189,9 @@ class Placement:
     ----------
     targets : tuple of PlacedTarget
     skipped : mapping of str to str
-        Why a target was not placed, by its name.
+        For targets that were not placed: name → reason.
     noise : ExtraNoise
-        Deviations beyond the stated ones that the residuals of all targets show, but of those that
-        have their own.
+        Noise beyond the stated one, from the residuals of all targets without their own.
     """
 
     targets: tuple[PlacedTarget, ...]
@@ -215,17 +216,17 @@ def place_targets(
     Parameters
     ----------
     sightings : sequence of Sighting
-        In the frames' order; second plates with the same code are passed over.
+        In the frames' order; second plates with the same code are ignored.
     targets : sequence of Target or PlainTarget
-        That stand still.
+        Static targets.
     poses : ReferencePoses
-        With standard deviations, unless they are to count as exact.
+        Their standard deviations are used unless `has_exact_poses`.
     min_frames : int
         Least number of frames.
     has_exact_poses : bool
-        Whether the deviations of the reference poses are disregarded.
+        Whether the standard deviations of the reference poses are ignored.
     motions : CameraMotions, optional
-        At the reference poses, of a rolling shutter's camera.
+        For a rolling shutter: motion of the camera at each reference pose.
     """
     orientations = ExteriorOrientations.of(poses, local_frame)
     exterior_cov = None if has_exact_poses else _exterior_cov(poses, orientations)
@@ -233,10 +234,10 @@ def place_targets(
     skipped: dict[str, str] = {}
     usable, all_views, all_frames = [], [], []
     for target in targets:
-        mine = [each for each in sightings if each.target == target.name and not each.instance]
-        posed = [each for each in mine if each.frame in rows and _has_pose(each)]
+        of_target = [each for each in sightings if each.target == target.name and not each.instance]
+        posed = [each for each in of_target if each.frame in rows and _has_pose(each)]
         if len(posed) < min_frames:
-            skipped[target.name] = _too_few(mine, posed, rows, min_frames)
+            skipped[target.name] = _too_few(of_target, posed, rows, min_frames)
             continue
         at = [rows[each.frame] for each in posed]
         moments, cov = _images(camera, posed, 0.5 * target.outer_diameter_m)
@@ -262,10 +263,10 @@ def place_targets(
         if isinstance(outcome, NoCircleError):
             skipped[target.name] = str(outcome)
             continue
-        own_px = outcome.noise.centre_px if outcome.is_apart else None
-        if own_px is not None and own_px >= MOST_EXTRA_PX:
+        own_px = outcome.noise.centre_px if outcome.has_own_noise else None
+        if own_px is not None and own_px >= MAX_EXTRA_PX:
             skipped[target.name] = (
-                f"its images contradict each other by {MOST_EXTRA_PX:.0f} px or more, those of"
+                f"its images contradict each other by {MAX_EXTRA_PX:.0f} px or more, those of"
                 " other targets do not"
             )
             continue
@@ -278,7 +279,7 @@ def place_targets(
             _CODED_EDGE_SD_PX,
         )
         if own_px is not None or outcome.step is not None:
-            # contradictions and steps may be alike in many frames: more frames do not reduce them
+            # such errors may be the same in many frames: averaging does not reduce them
             common = common + (np.count_nonzero(outcome.fit.is_used) - 1.0) * outcome.fit.cov
         placed.append(_on_the_map(target, frames, outcome, own_px, common, local_frame))
     return Placement(tuple(placed), skipped, noise)
@@ -287,25 +288,27 @@ def place_targets(
 def _at_their_rows(
     camera: Camera, views: CircleViews, motions: CameraMotions, at: Sequence[int]
 ) -> CircleViews:
-    """Return views from where a rolling shutter's camera is when the circle's row is exposed.
+    """Return views with the poses of a rolling shutter's camera at the circles' rows.
 
-    A motion that no poses tell is mostly the same in all frames: flown with the same speed.
+    Where poses do not show the motion, it counts as the same in all frames, since a flight mostly
+    has one speed.
     """
     delay_s = camera.delay_s(views.moments[:, :2])
-    turns = delay_s[:, None] * motions.turn_rad_s[at]
+    rotation_vectors = delay_s[:, None] * motions.turn_rad_s[at]
     effects = np.zeros((len(at), 6, 6))
-    shift_sds_m, turn_sds = (
+    sds_m, sds_rad = (
         delay_s * motions.sd_velocity_m_s[at],
         delay_s * motions.sd_turn_rad_s[at],
     )
-    effects[:, :3, :3] = shift_sds_m[:, None, None] * views.world_from_camera
-    effects[:, 3:, 3:] = turn_sds[:, None, None] * views.world_from_camera
+    effects[:, :3, :3] = sds_m[:, None, None] * views.world_from_camera
+    effects[:, 3:, 3:] = sds_rad[:, None, None] * views.world_from_camera
     cov = effects @ np.swapaxes(effects, 1, 2)
     is_common = ~motions.is_seen[at]
     return replace(
         views,
         camera_m=views.camera_m + delay_s[:, None] * motions.velocity_m_s[at],
-        world_from_camera=Rotation.from_rotvec(turns).as_matrix() @ views.world_from_camera,
+        world_from_camera=Rotation.from_rotvec(rotation_vectors).as_matrix()
+        @ views.world_from_camera,
         exterior_cov=cov if views.exterior_cov is None else views.exterior_cov + cov,
         common_effects=effects * is_common[:, None, None] if is_common.any() else None,
     )
@@ -320,24 +323,24 @@ def _has_pose(sighting: Sighting) -> bool:
 
 
 def _too_few(
-    mine: Sequence[Sighting],
+    of_target: Sequence[Sighting],
     posed: Sequence[Sighting],
     rows: Mapping[str, int],
     min_frames: int,
 ) -> str:
-    if not mine:
+    if not of_target:
         return "measured in no frame"
-    oriented = sum(each.frame in rows for each in mine)
+    oriented = sum(each.frame in rows for each in of_target)
     if oriented > len(posed):
         return f"{oriented - len(posed)} of its measurements have no covariance"
     return (
-        f"measured in {len(mine)} frames, {len(posed)} of them with a reference pose;"
+        f"measured in {len(of_target)} frames, {len(posed)} of them with a reference pose;"
         f" {min_frames} are needed"
     )
 
 
 def _exterior_cov(poses: ReferencePoses, orientations: ExteriorOrientations) -> FloatArray | None:
-    """Return the covariances (n, 6, 6) of positions [m] and turns [rad] in the ENU frame."""
+    """Return the covariances (n, 6, 6) of positions [m] and rotations [rad] in the ENU frame."""
     if orientations.cov_m2 is None and poses.sd_angle_deg is None:
         return None
     cov = np.zeros((len(poses.frames), 6, 6))
@@ -353,8 +356,8 @@ def _images(
 ) -> tuple[FloatArray, FloatArray]:
     """Return moments (n, 5) and covariances (n, 5, 5) of a target's outer circle.
 
-    Those of a plain target were measured: its pose has what was assumed of its normal in it, which
-    n frames together would make √n times surer.
+    Those of a plain target are measured. They are not computed from its poses, because these depend
+    on the prior of the normal, which would count n times in n frames.
     """
     plain = [each.image for each in sightings if each.image is not None]
     if len(plain) == len(sightings):
@@ -368,17 +371,17 @@ def _images(
 def ring_images(
     camera: Camera, poses: Sequence[Pose], pose_covs: Sequence[FloatArray], radius_m: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return moments (n, 5) of circles, and their covariances (n, 5, 5), by n measured poses.
+    """Return moments (n, 5) of circles and covariances (n, 5, 5) from n measured poses.
 
-    A pose has six numbers, of which the turn about the normal does not move the circle: the five
-    others and the five moments follow from each other.
+    Of the six parameters of a pose, the rotation about the normal does not affect the circle. The
+    other five and the five moments determine each other.
 
     Parameters
     ----------
     poses, pose_covs
-        Of the targets in the camera frame, as measured with this radius.
+        Poses of the targets in the camera frame, measured with this radius.
     radius_m : float
-        Of the circle that was assumed.
+        Radius of the circle.
     """
     slopes = circle_derivatives(camera, _circles(poses, radius_m))
     by_pose = np.concatenate((slopes.by_centre, slopes.by_rotation), axis=2)
@@ -387,11 +390,11 @@ def ring_images(
 
 
 def _with_floor(moments: FloatArray, cov: FloatArray) -> FloatArray:
-    """Return covariances (n, 5, 5) of which none is smaller than prints allow."""
+    """Return covariances (n, 5, 5) enlarged by the least error of an outline."""
     size = np.sqrt(np.maximum(moments[:, 2] + moments[:, 4], 0.0))
     floor = np.ones((len(moments), 5))
     floor[:, 2:] = size[:, None]
-    return np.asarray(cov + _FLOOR_PX**2 * floor[:, :, None] ** 2 * np.eye(5))
+    return np.asarray(cov + _MIN_OUTLINE_SD_PX**2 * floor[:, :, None] ** 2 * np.eye(5))
 
 
 def _circles(poses: Sequence[Pose], radius_m: float) -> Circles3D:
@@ -410,7 +413,7 @@ def _on_the_map(
     common_cov: FloatArray,
     local_frame: LocalFrame,
 ) -> PlacedTarget:
-    """Return a circle in the axes of the map, compared with what is stated of its target."""
+    """Return a circle in the map's axes, compared with the statements on its target."""
     fit = placed.fit
     circle = fit.circle
     enu_from_map = local_frame.grid_rotation(circle.centre_m)
@@ -456,7 +459,7 @@ def _check(
     enu_from_map: FloatArray,
     local_frame: LocalFrame,
 ) -> PlaceCheck:
-    """Compare a circle with the stated place and diameter of its target."""
+    """Compare a circle with the stated position and diameter of its target."""
     residual, residual_cov = None, None
     if target.position_m is not None:
         stated = static_position(target.position_m, target, local_frame)

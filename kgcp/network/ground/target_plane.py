@@ -1,13 +1,12 @@
 """A circle in space from its images in oriented frames: centre, normal and radius.
 
-After Otepka & Fraser (2004), section 2.2, with two changes. The observations are centroid and
-second moments of the circle's image (`kgcp.geometry.circle_image`), which are regular everywhere,
-also for a circle seen from straight above; and the normal has two unknowns instead of elements and
-constraints.
+The method follows Otepka & Fraser (2004), section 2.2, with two changes. The observations are
+centroid and second moments of the circle's image (`kgcp.geometry.circle_image`), which are regular
+everywhere, even for a circle seen frontally. The normal has two unknowns, instead of three elements
+and a constraint.
 
-One image has two circles of a given radius behind it (Kager 1981). Two frames from different
-directions tell them apart. Both are followed to the end here, and how much worse the other one
-fits is part of the result.
+Two circles of a given radius have the same image (Kager 1981). Frames from two different directions
+distinguish them. Both are adjusted here, and the result includes how much worse the other one fits.
 """
 
 from __future__ import annotations
@@ -40,23 +39,26 @@ from kgcp.network.ground.space_circle import (
 )
 
 LEAST_FRAMES = 2
-"""Frames with fewer than which a circle has no place: the rays of one do not meet."""
+"""Least number of frames that place a circle: a single ray has no intersection."""
 
-_MOST_STEPS = 60
-_ROUND_STEPS = 3  # between two reweightings, of what changes anyway
-_CONVERGED = 1e-5  # decrease of χ² that means nothing
-_ROBUST_ROUNDS = 12
-_CAUCHY_CHI2 = 12.0
+_MAX_STEPS = 60
+_ROUND_STEPS = 3  # steps per round of reweighting: the next weights move the minimum anyway
+_CONVERGED = 1e-5  # decrease of χ² at which the iteration ends
+_MAX_ROBUST_ROUNDS = 12
+_CAUCHY_CHI2 = 12.0  # χ² of a frame that has weight 1/2
 _MEDIAN_CHI2 = 4.351  # of five numbers
 _SAME_NORMAL_DEG = 0.5
-_LEAST_KEPT = 0.5  # share of the frames: if fewer agree, none is believed
+_MIN_KEPT = 0.5  # share of the frames that must agree; otherwise the circle is refused
 REJECTED_CHI2 = 37.0
-"""Of a frame's five numbers, at most: by chance once in 1.7 million, as 5 σ of one."""
+"""Limit of the χ² of a frame's five numbers. Chance exceeds it once in 1.7 million, like 5 σ of a
+single number."""
 
-MOST_EXTRA_PX = 100.0
-"""Largest deviation that is estimated [px]; where it is reached, nothing fits."""
+MAX_EXTRA_PX = 100.0
+"""Largest additional standard deviation that is estimated [px]; if it is reached, nothing fits."""
 
-_MANY, _LEAST_FACTOR = 200, 0.25  # degrees of freedom that tell a variance factor, and its least
+# Stated variances are scaled down only with at least so many degrees of freedom, and by no smaller
+# factor than this.
+_MIN_FREEDOM, _MIN_FACTOR = 200, 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,13 +68,13 @@ class CircleFit:
     circle: SpaceCircle
     cov: FloatArray  # (6, 6): in the order of `SpaceCircle.moved`
     residuals: FloatArray  # (n, 5): observed minus computed moments
-    chi2: FloatArray  # (n,): squared residuals of each frame over their own covariance
+    chi2: FloatArray  # (n,): squared residuals of each frame over their covariance
     is_used: BoolArray  # (n,): whether a frame took part
-    cost: float  # robust sum of squares over all frames, by which two fits are compared
+    cost: float  # robust sum of χ² over all frames, to compare two fits
 
     @property
     def variance_factor(self) -> float:
-        """Weighted squares of the residuals per degree of freedom, of the frames that are used."""
+        """χ² per degree of freedom, of the frames that are used."""
         freedom = 5 * int(np.count_nonzero(self.is_used)) - 6
         return float(np.sum(self.chi2[self.is_used])) / freedom
 
@@ -84,28 +86,29 @@ class PlacedCircle:
     Attributes
     ----------
     fit : CircleFit
-        The better one of the two normals.
+        The fit with the better of the two normals.
     other : CircleFit or None
-        The other one; None: it leads to the same circle.
+        The fit with the mirrored normal; None: it leads to the same circle.
     ambiguity : float
         Δχ² by which the mirrored normal fits worse.
     noise : ExtraNoise
-        What was added to the stated covariances.
-    is_apart : bool
-        Whether that is its own, since its images contradict each other more than those of others.
+        Noise added to the stated covariances.
+    has_own_noise : bool
+        Whether this noise is estimated for this circle alone, because its images contradict each
+        other much more than those of the others.
     move : Split or None
-        That it was moved while it was photographed; the fit is to the frames of one place. None:
-        nothing is seen of that.
+        A move of the circle while it was photographed; the fit is to the frames of one place. None:
+        there are no signs of a move.
     step : Split or None
-        That poses may have changed instead; the fit is to the frames of both places. None: nothing
-        is seen of that.
+        An apparent move that steps of the poses may explain; the fit is to the frames of both
+        places. None: there are no signs of one.
     """
 
     fit: CircleFit
     other: CircleFit | None
     ambiguity: float
     noise: ExtraNoise
-    is_apart: bool = False
+    has_own_noise: bool = False
     move: Split | None = None
     step: Split | None = None
 
@@ -115,24 +118,24 @@ def place_circle(
     views: CircleViews,
     noise: ExtraNoise = ExtraNoise(),  # noqa: B008 - frozen
 ) -> PlacedCircle:
-    """Adjust a circle to its images, without a start, frames that do not fit left out.
+    """Adjust a circle to its images without approximate values, leaving out frames that do not fit.
 
     Parameters
     ----------
     camera : Camera
-        Its lens acts on every point of the outline.
+        Its distortion is applied to every point of the outline.
     views : CircleViews
-        Of at least `LEAST_FRAMES` frames from different places.
+        At least `LEAST_FRAMES` frames from different places.
 
     Returns
     -------
     PlacedCircle
-        Without common errors: see `common_covariance`.
+        Its covariance lacks the errors that all frames share: see `common_covariance`.
 
     Raises
     ------
     NoCircleError
-        If the rays do not meet before the cameras, no plane explains the shapes, or fewer than
+        If the rays do not meet in front of the cameras, no plane explains the shapes, or fewer than
         half of the frames agree.
     """
     starts = circle_starts(camera, views)
@@ -144,7 +147,7 @@ def place_circle(
     other = _fit(camera, views, mirrored, noise)
     if other is not None and other.cost < best.cost:
         best, other = other, best
-    if np.count_nonzero(best.is_used) < max(LEAST_FRAMES, _LEAST_KEPT * len(views)):
+    if np.count_nonzero(best.is_used) < max(LEAST_FRAMES, _MIN_KEPT * len(views)):
         used = int(np.count_nonzero(best.is_used))
         raise NoCircleError(f"only {used} of {len(views)} frames agree with each other")
     if other is None or _is_same(best.circle, other.circle):
@@ -153,7 +156,7 @@ def place_circle(
 
 
 def circle_through(camera: Camera, views: CircleViews, noise: ExtraNoise) -> SpaceCircle | None:
-    """Return the circle of least squares through a few views, none left out; None: there is none.
+    """Return the least-squares circle of a few views, using all of them; None if there is none.
 
     Raises
     ------
@@ -174,14 +177,14 @@ def circle_through(camera: Camera, views: CircleViews, noise: ExtraNoise) -> Spa
 def without_other(
     camera: Camera, views: CircleViews, best: CircleFit, noise: ExtraNoise
 ) -> PlacedCircle:
-    """Return a circle whose mirrored normal leads to no other place."""
+    """Return a placed circle for which the mirrored normal leads to the same fit."""
     mirrored = best.circle.mirrored(views.camera_m[best.is_used])
     worse = _robust_cost(_chi2_of(camera, views, mirrored, noise))
     return PlacedCircle(best, None, max(0.0, worse - best.cost), noise)
 
 
 def seen_in(camera: Camera, views: CircleViews, placed: PlacedCircle, part: BoolArray) -> CircleFit:
-    """Return the fit to a part (n,) of the frames with the residuals of all of them."""
+    """Return the fit to some of the frames (n,), completed by the residuals of all frames."""
     fit = placed.fit
     residuals = views.moments - circle_images(camera, fit.circle.in_cameras(views)).moments
     is_used = part.copy()
@@ -191,13 +194,13 @@ def seen_in(camera: Camera, views: CircleViews, placed: PlacedCircle, part: Bool
 
 
 def extra_noise(camera: Camera, placed: Sequence[tuple[CircleViews, CircleFit]]) -> ExtraNoise:
-    """Return how large the images' deviations are beyond the stated ones, by the residuals.
+    """Return the noise of the images beyond the stated one, estimated from the residuals.
 
-    Places and shapes apart: the weighted squares of all circles' residuals are made to be as many
-    as there are degrees of freedom. Where they are smaller than stated, in enough images to tell,
-    the stated variances are scaled.
+    It is estimated separately for places and shapes, so that χ² of all circles equals the degrees
+    of freedom. If χ² is smaller with the stated covariances alone, and there are enough images,
+    these are scaled down instead.
     """
-    found, factors = [], []
+    sds_px, factors = [], []
     for part, unknowns in ((slice(0, 2), 3), (slice(2, 5), 3)):
         residuals, stated, unit, freedom = [], [], [], 0
         for views, fit in placed:
@@ -210,11 +213,11 @@ def extra_noise(camera: Camera, placed: Sequence[tuple[CircleViews, CircleFit]])
         sd, factor = _excess(
             np.concatenate(residuals), np.concatenate(stated), np.concatenate(unit), freedom
         )
-        # errors of poses that all frames share do not show in residuals: their deviations stay
+        # small residuals do not prove exact poses: they hide pose errors that all frames share
         is_of_poses = part.start == 0 and any(views.exterior_cov is not None for views, _ in placed)
-        found.append(sd)
+        sds_px.append(sd)
         factors.append(1.0 if is_of_poses else factor)
-    return ExtraNoise(*found, *factors)
+    return ExtraNoise(*sds_px, *factors)
 
 
 def common_covariance(
@@ -225,19 +228,22 @@ def common_covariance(
     calibration_cov: FloatArray | None,
     edge_sd_px: float,
 ) -> FloatArray:
-    """Return the covariance (6, 6) of what all frames have alike, and averaging does not reduce.
+    """Return the covariance (6, 6) from errors that all frames share, which averaging keeps.
 
-    Four errors: the calibration's; edges that are displaced in all images by as many pixels; a
-    shift of all projection centres, as large as their mean covariance says: how much of it is
-    common is not known, an adjustment that hangs on few control points shifts as a whole; and the
-    common errors of `views`.
+    There are four of them:
+
+    - errors of the calibration;
+    - a displacement of edges by the same number of pixels in all images;
+    - a shift of all projection centres, with their mean covariance: how much of it is common is
+      unknown, and a block with few control points shifts as a whole;
+    - the common errors of `views`.
 
     Parameters
     ----------
     calibration_cov : (12, 12) array or None
-        By `CALIBRATION_PARAMETERS`; None: not known.
+        Covariance of `CALIBRATION_PARAMETERS`; None: unknown.
     edge_sd_px : float
-        Of the displacement of edges, the same in all frames [px].
+        Standard deviation of the common displacement of edges [px].
     """
     kept = views.chosen(fit.is_used)
     circles = fit.circle.in_cameras(kept)
@@ -270,9 +276,9 @@ def common_covariance(
 def _fit(
     camera: Camera, views: CircleViews, start: SpaceCircle, noise: ExtraNoise
 ) -> CircleFit | None:
-    """Return the robust fit from a start; None if it leads nowhere."""
+    """Return the robust fit from a start; None if it does not converge to a circle."""
     circle, weights = start, np.ones(len(views))
-    for _ in range(_ROBUST_ROUNDS):
+    for _ in range(_MAX_ROBUST_ROUNDS):
         covs = total_covariances(camera, views, circle, noise)
         moved = _minimised(camera, views, circle, covs, weights, _ROUND_STEPS)
         if moved is None:
@@ -280,9 +286,9 @@ def _fit(
         circle = moved
         chi2 = _chi2(camera, views, circle, covs)
         scale = max(1.0, float(np.median(chi2)) / _MEDIAN_CHI2)
-        renewed = 1.0 / (1.0 + chi2 / (_CAUCHY_CHI2 * scale))
-        is_settled = np.allclose(renewed, weights, atol=1e-3)
-        weights = renewed
+        next_weights = 1.0 / (1.0 + chi2 / (_CAUCHY_CHI2 * scale))
+        is_settled = np.allclose(next_weights, weights, atol=1e-3)
+        weights = next_weights
         if is_settled:
             break
     return fit_to_agreeing(camera, views, circle, noise)
@@ -291,11 +297,11 @@ def _fit(
 def fit_to_agreeing(
     camera: Camera, views: CircleViews, circle: SpaceCircle, noise: ExtraNoise
 ) -> CircleFit | None:
-    """Return the fit to the frames that agree: all others are rejected as a whole."""
+    """Return the fit to the frames that agree; the others are rejected."""
     used = np.zeros(len(views), dtype=np.bool_)
     covs = total_covariances(camera, views, circle, noise)
     chi2 = _chi2(camera, views, circle, covs)
-    for _ in range(_ROBUST_ROUNDS):
+    for _ in range(_MAX_ROBUST_ROUNDS):
         scale = max(1.0, float(np.median(chi2)) / _MEDIAN_CHI2)
         kept = chi2 <= REJECTED_CHI2 * scale
         if np.array_equal(kept, used) or np.count_nonzero(kept) < LEAST_FRAMES:
@@ -323,14 +329,14 @@ def _minimised(
     circle: SpaceCircle,
     covs: FloatArray,
     weights: FloatArray,
-    most_steps: int = _MOST_STEPS,
+    max_steps: int = _MAX_STEPS,
 ) -> SpaceCircle | None:
-    """Return the circle with the least weighted squares by Levenberg's damped steps."""
+    """Return the circle with the least weighted squares, by Levenberg's damped steps."""
     damping, cost = 1e-4, _weighted_cost(camera, views, circle, covs, weights)
     if not math.isfinite(cost):
         return None
     weighted = covs / np.maximum(weights, 1e-12)[:, None, None]
-    for _ in range(most_steps):
+    for _ in range(max_steps):
         normal, right = _normal_equations(camera, views, circle, weighted)
         scale = 1.0 / np.sqrt(np.diag(normal))
         while True:
@@ -362,13 +368,13 @@ def _weighted_cost(
     covs: FloatArray,
     weights: FloatArray,
 ) -> float:
-    counted = weights > 0.0
-    squares = _chi2(camera, views, circle, covs)[counted]
-    return float(np.sum(weights[counted] * squares)) if np.isfinite(squares).all() else math.inf
+    is_used = weights > 0.0
+    squares = _chi2(camera, views, circle, covs)[is_used]
+    return float(np.sum(weights[is_used] * squares)) if np.isfinite(squares).all() else math.inf
 
 
 def _chi2(camera: Camera, views: CircleViews, circle: SpaceCircle, covs: FloatArray) -> FloatArray:
-    """Return the squares (n,) of all frames' residuals over covariances; infinite: unseen."""
+    """Return the χ² (n,) of all frames; infinite if the circle is not in front of the camera."""
     residuals = views.moments - circle_images(camera, circle.in_cameras(views)).moments
     squares = np.einsum("nm,nm->n", residuals, np.linalg.solve(covs, residuals[..., None])[..., 0])
     return np.asarray(np.where(np.isfinite(squares), squares, np.inf))
@@ -413,7 +419,7 @@ def _design(
 def total_covariances(
     camera: Camera, views: CircleViews, circle: SpaceCircle, noise: ExtraNoise
 ) -> FloatArray:
-    """Return the covariances (n, 5, 5) of moments with everything that differs between frames."""
+    """Return the covariances (n, 5, 5) of moments by all errors that differ between frames."""
     unit = outline_noise(views.moments)
     extra = np.zeros_like(unit)
     extra[:, :2, :2] = noise.centre_px**2 * unit[:, :2, :2]
@@ -423,7 +429,7 @@ def total_covariances(
 
 
 def _stated(camera: Camera, views: CircleViews, circle: SpaceCircle) -> FloatArray:
-    """Return the stated covariances (n, 5, 5): of the images, and of the exterior orientations."""
+    """Return the stated covariances (n, 5, 5) of the moments: by images and orientations."""
     if views.exterior_cov is None:
         return views.cov
     by_exterior = _moments_by_exterior(camera, views, circle)
@@ -448,9 +454,9 @@ def _moments_by_exterior(camera: Camera, views: CircleViews, circle: SpaceCircle
 def _excess(
     residuals: FloatArray, stated: FloatArray, unit: FloatArray, freedom: int
 ) -> tuple[float, float]:
-    """Return σ ≥ 0 and a factor ≤ 1, such that the squares are as many as `freedom`.
+    """Return σ ≥ 0 and a factor ≤ 1 with which χ² equals `freedom`.
 
-    They are over stated + σ² unit, or over stated times the factor.
+    Covariances are `stated` + σ² `unit`, or the factor times `stated`.
     """
 
     def squares(sd: float) -> float:
@@ -461,10 +467,10 @@ def _excess(
         return 0.0, 1.0
     ratio = squares(0.0) / freedom
     if ratio <= 1.0:
-        return 0.0, max(ratio, _LEAST_FACTOR) if freedom >= _MANY else 1.0
-    if squares(MOST_EXTRA_PX) > freedom:
-        return MOST_EXTRA_PX, 1.0
-    sd = optimize.brentq(lambda sd: squares(sd) - freedom, 0.0, MOST_EXTRA_PX, xtol=1e-12)
+        return 0.0, max(ratio, _MIN_FACTOR) if freedom >= _MIN_FREEDOM else 1.0
+    if squares(MAX_EXTRA_PX) > freedom:
+        return MAX_EXTRA_PX, 1.0
+    sd = optimize.brentq(lambda sd: squares(sd) - freedom, 0.0, MAX_EXTRA_PX, xtol=1e-12)
     return float(sd), 1.0
 
 

@@ -33,7 +33,7 @@ from kgcp.io.tables.places import (
 )
 from kgcp.io.tables.provenance import derived_provenance
 from kgcp.network.ground.target_places import PlacedTarget, Placement, TargetMove, place_targets
-from kgcp.network.ground.target_plane import MOST_EXTRA_PX
+from kgcp.network.ground.target_plane import MAX_EXTRA_PX
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.export import write_formats
 from kgcp.pipeline.frame_priors import motions_while_read
@@ -209,10 +209,10 @@ def _require_fit(placement: Placement, flight: Flight, poses: Path | None) -> No
     if not placement.targets:
         name, reason = next(iter(placement.skipped.items()))
         raise KgcpError(f"no target can be placed: {name!r} {reason}")
-    if placement.noise.centre_px >= MOST_EXTRA_PX:
+    if placement.noise.centre_px >= MAX_EXTRA_PX:
         raise KgcpError(
             f"{poses or flight.folder / 'flight.toml'}: the poses do not fit the images, by"
-            f" {MOST_EXTRA_PX:.0f} px or more; look whether angles are of the stated kind, and"
+            f" {MAX_EXTRA_PX:.0f} px or more; look whether angles are of the stated kind, and"
             " whether each pose has its own frame's name",
             option=None if poses is None else "poses",
         )
