@@ -24,24 +24,24 @@ from kgcp.targets.shapes import (
 )
 
 _MM = 1e3
-_MARGIN = 0.6  # of the pitch, around the outermost discs' edges
-_MARGIN_OF_POINTS = 0.5  # of the largest diameter, around the outermost discs or codes
+_MARGIN = 0.6  # around the outermost discs' edges, relative to the pitch
+_POINT_MARGIN = 0.5  # around the outermost discs or codes, relative to the largest diameter
 _LETTER_MM = 4.0
 _LEGEND_MM = 16.0
-_FLAT_M = 1e-6  # what is in one plane
-_STEPS = 120  # of a circle, for sectors
+_FLATNESS_M = 1e-6  # largest distance from the plane of a sheet
+_ARC_STEPS = 120  # chords per full circle, for sectors
 
 
 def draw_field(field: AnyField) -> Artwork:
     """Return a field with a legend and a ruler below it, about its middle.
 
-    Bright discs are white paper in an inked board; holes show the board. Of points, x is to the
-    right and y down, and z is into the paper: a plane can be seen from either side.
+    Bright discs are white paper in an inked board; holes show the board. For fields of points, x
+    points to the right, y down and z into the paper, which decides the side that is printed.
 
     Raises
     ------
     SettingError
-        If the points are no flat sheet, or their diameters are not known.
+        If the points do not lie in a plane, or their diameters are not known.
     """
     if isinstance(field, PointField):
         _require_sheet(field)
@@ -71,8 +71,8 @@ def draw_field(field: AnyField) -> Artwork:
 
 
 def _require_sheet(field: PointField) -> None:
-    is_flat = np.ptp(field.points_m()[:, 2]) <= _FLAT_M
-    if not is_flat or np.abs(field.normals()[:, :2]).max() > _FLAT_M:
+    is_flat = np.ptp(field.points_m()[:, 2]) <= _FLATNESS_M
+    if not is_flat or np.abs(field.normals()[:, :2]).max() > _FLATNESS_M:
         raise SettingError(
             "points",
             "do not lie in one plane of equal z, as on a sheet",
@@ -87,7 +87,7 @@ def _reach_mm(field: AnyField) -> float:
     largest = _MM * float(field.radii_m().max())
     if isinstance(field, Field):
         return largest + _MARGIN * _MM * field.pitch_m
-    return largest * ((1.0 if field.code is None else field.code.outer) + 2.0 * _MARGIN_OF_POINTS)
+    return largest * ((1.0 if field.code is None else field.code.outer) + 2.0 * _POINT_MARGIN)
 
 
 def _described(field: AnyField) -> str:
@@ -106,7 +106,7 @@ def _codes(field: PointField, layer: Layer, centres_mm: FloatArray) -> Iterator[
         if field.code is None or point.code is None:
             continue
         for first, last in _runs(point.code, field.code.bits):
-            steps = max(math.ceil(_STEPS * (last - first) / field.code.bits), 2)
+            steps = max(math.ceil(_ARC_STEPS * (last - first) / field.code.bits), 2)
             turns = 2.0 * np.pi / field.code.bits * np.linspace(first, last, steps + 1)
             around = np.stack((np.cos(turns), np.sin(turns)), axis=1)
             edge = np.concatenate((field.code.outer * around, field.code.inner * around[::-1]))

@@ -17,22 +17,24 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.settings import require_range
 
 LEAST_POINTS, MOST_POINTS = 6, 5000
-"""Of a field: fewer determine no pose with something to check it."""
+"""Numbers of discs of a field. Fewer would determine a pose, but hardly check it."""
 
-_LARGEST_DISC_M = 3.0  # diameter: 3 mm and more, typed for metres, are told
-_MOST_OFF_BAR = 0.05  # of the stated distance of its discs
-_MOST_APART_SDS = 5.0  # of two bars between the same discs, of their difference's deviation
+_MAX_DISC_M = 3.0  # diameter; so millimetres given as metres are noticed from 3 mm on
+_MAX_BAR_ERROR = 0.05  # relative difference of a bar from the stated distance of its discs
+# Largest difference of two bars between the same discs, in its standard deviations.
+_MAX_BAR_DIFFERENCE_SIGMAS = 5.0
 
 
 class GridKind(StrEnum):
-    """How the discs of a field lie to each other."""
+    """Arrangement of a field's discs."""
 
     SQUARE = "square"  # rows and columns
-    # as OpenCV counts: every second row is shifted by `pitch`, which is also the rows' distance;
-    # `columns` discs in a row, 2 `pitch` apart
+    # as in OpenCV: `columns` discs in a row, 2 `pitch` apart; rows are `pitch` apart, and every
+    # second one is shifted by `pitch`
     ASYMMETRIC = "asymmetric"
-    # as BoofCV counts: equal distances to six neighbours; every second place of `columns` by `rows`
-    # half-steps has a disc, and of the last row, from which BoofCV counts, the first place
+    # as in BoofCV: six neighbours at equal distances; of `columns` by `rows` places, half a step
+    # apart, every second one has a disc; the first place of the last row, from which BoofCV counts,
+    # has one
     HEXAGONAL = "hexagonal"
 
 
@@ -50,11 +52,11 @@ class Mark:
     Attributes
     ----------
     column, row : int
-        Its place, as the discs of its row are counted, from 0.
+        Its place: number of the disc in its row, and of the row, from 0.
     diameter_m : float
         Outer diameter [m].
     inner_diameter_m : float
-        Of its hole [m]; 0: none.
+        Diameter of its hole [m]; 0: no hole.
     is_missing : bool
         Whether the place is empty.
     """
@@ -90,21 +92,21 @@ class Field:
     pitch_m : float
         Distance of neighbours [m]; for asymmetric grids, of rows.
     diameter_m, inner_diameter_m : float
-        Of all discs but marks [m]; an inner diameter above 0 makes them rings.
+        Diameters of all discs but marks [m]; an inner diameter above 0 makes them rings.
     polarity : FieldPolarity
     marks : tuple of Mark
         Discs that differ.
     flat_sd_m : tuple of float
-        How far discs may be from where they are printed, along x, y, z: standard deviations [m].
+        Standard deviations of the discs' stated coordinates along x, y, z [m].
     bars : tuple of FieldBar
         Measured distances.
     is_diameter_stated : bool
-        Whether the diameters are known; otherwise only their ratios are meant.
+        Whether the diameters are known; otherwise only their ratios count.
 
     Raises
     ------
     SettingError
-        On making one, for what cannot be a field.
+        On construction, if the field is impossible.
     """
 
     name: str
@@ -183,7 +185,7 @@ class Field:
         return [place for place in self._places() if place not in missing]
 
     def names(self) -> tuple[str, ...]:
-        """Return the names of all discs: r2c3 is the fourth of the third row."""
+        """Return the names of all discs: r2c3 is the fourth disc of the third row."""
         return tuple(f"r{row}c{column}" for column, row in self.discs())
 
     @property
@@ -193,7 +195,7 @@ class Field:
 
     @property
     def turns(self) -> int:
-        """In how many directions the lattice looks the same: 4 or 6."""
+        """Number of rotations under which the lattice looks the same: 4 or 6."""
         return 6 if self.kind is GridKind.HEXAGONAL else 4
 
     def basis_m(self) -> FloatArray:
@@ -214,31 +216,31 @@ class Field:
             # x = 2 column + row % 2 and y = row, in steps of pitch, are u - v and u + v
             across = 2 * column + row % 2
             return np.stack(((across + row) // 2, (row - across) // 2), axis=1)
-        # x = column + shift / 2 and y = row, in steps of pitch and row, are u + v / 2 and v: but
-        # for half a step where the first row is shifted
+        # x = column + shift / 2 and y = row, in steps of pitch and row, are u + v / 2 and v, up to
+        # half a step if the first row is shifted
         return np.stack((column + (self._shift(row) - row) // 2, row), axis=1)
 
     def points_m(self) -> FloatArray:
-        """Return where the discs are meant to be (m, 3), in the field's frame [m]."""
+        """Return the stated positions (m, 3) of the discs, in the field's frame [m]."""
         flat = self.nodes() @ self.basis_m().T
         return np.column_stack((flat, np.zeros(len(flat))))
 
     def point_sds_m(self) -> FloatArray:
-        """Return how far they may be from there (m, 3): standard deviations [m]."""
+        """Return the standard deviations (m, 3) of the stated positions [m]."""
         return np.tile(self.flat_sd_m, (len(self.discs()), 1))
 
     def normals(self) -> FloatArray:
-        """Return unit vectors (m, 3) square to the discs: the field's z axis."""
+        """Return the unit normals (m, 3) of the discs: the field's z axis."""
         return np.tile([0.0, 0.0, 1.0], (len(self.discs()), 1))
 
     @property
     def named_by(self) -> str:
-        """What gives the discs of a photograph their names."""
+        """How discs are identified."""
         return "lattice"
 
     @property
     def starts_from_homographies(self) -> bool:
-        """Whether photographs are first taken for those of the plane z = 0."""
+        """Whether start values come from homographies of the plane z = 0."""
         return True
 
     def radii_m(self) -> FloatArray:
@@ -250,9 +252,9 @@ class Field:
         return self._by_disc(self.inner_diameter_m, {m: m.inner_diameter_m for m in self.marks}) / 2
 
     def symmetries(self) -> list[IndexArray]:
-        """Return the turns under which the field looks the same, but for none at all.
+        """Return the rotations under which the field looks the same, without the identity.
 
-        Each is a permutation (m,): disc i comes to lie where disc `turn[i]` was.
+        Each is a permutation `order` (m,): disc i moves to the place of disc `order[i]`.
         """
         points, radii, holes = self.points_m()[:, :2], self.radii_m(), self.inner_radii_m()
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
@@ -262,14 +264,14 @@ class Field:
             cosine, sine = math.cos(angle), math.sin(angle)
             turned = (points - middle) @ np.array([[cosine, sine], [-sine, cosine]]) + middle
             gaps = np.linalg.norm(turned[:, None] - points, axis=2)
-            turn = gaps.argmin(axis=1)
+            order = gaps.argmin(axis=1)
             is_onto = gaps.min(axis=1).max() < 0.01 * self.pitch_m
-            if is_onto and np.all(radii[turn] == radii) and np.all(holes[turn] == holes):
-                permutations.append(turn)
+            if is_onto and np.all(radii[order] == radii) and np.all(holes[order] == holes):
+                permutations.append(order)
         return permutations
 
     def with_diameters(self, scale: float) -> Field:
-        """Return the field with all diameters multiplied, as they were measured."""
+        """Return the field with all diameters multiplied by a factor."""
         marks = tuple(
             replace(
                 mark,
@@ -287,10 +289,10 @@ class Field:
 
 
 def check_bars(bars: tuple[FieldBar, ...], names: tuple[str, ...], points_m: FloatArray) -> None:
-    """Raise `SettingError` for bars that are not between two discs with these names and places.
+    """Raise `SettingError` for bars that do not fit two discs with these names and places.
 
-    A print may be off by some percent. A bar of another length is between other discs, or mistyped,
-    and would bend the field until it fits.
+    The scale of a print may be wrong by a few per cent. A bar that differs by more connects other
+    discs or is a typing error, and would deform the field.
     """
     for bar in bars:
         for key, name in (("from", bar.first), ("to", bar.second)):
@@ -306,7 +308,7 @@ def check_bars(bars: tuple[FieldBar, ...], names: tuple[str, ...], points_m: Flo
         require_range("sd_m", bar.sd_m, 0.0, 1.0, unit="m", open_low=True)
         ends_m = points_m[[names.index(bar.first), names.index(bar.second)]]
         stated_m = float(np.linalg.norm(ends_m[1] - ends_m[0]))
-        if abs(bar.length_m - stated_m) > _MOST_OFF_BAR * stated_m:
+        if abs(bar.length_m - stated_m) > _MAX_BAR_ERROR * stated_m:
             raise SettingError(
                 "length_m",
                 f"{bar.length_m:g} m, but {bar.first} and {bar.second} are {stated_m:g} m apart",
@@ -316,11 +318,11 @@ def check_bars(bars: tuple[FieldBar, ...], names: tuple[str, ...], points_m: Flo
 
 
 def _check_repeated_bars(bars: tuple[FieldBar, ...]) -> None:
-    """Raise `SettingError` for two bars of one pair whose lengths contradict each other."""
+    """Raise `SettingError` for two bars between the same discs with contradictory lengths."""
     first_of: dict[frozenset[str], FieldBar] = {}
     for bar in bars:
         first = first_of.setdefault(frozenset((bar.first, bar.second)), bar)
-        most_m = _MOST_APART_SDS * math.hypot(bar.sd_m, first.sd_m)
+        most_m = _MAX_BAR_DIFFERENCE_SIGMAS * math.hypot(bar.sd_m, first.sd_m)
         if abs(bar.length_m - first.length_m) > most_m:
             raise SettingError(
                 "length_m",
@@ -331,14 +333,14 @@ def _check_repeated_bars(bars: tuple[FieldBar, ...]) -> None:
 
 
 def require_diameter(key: str, diameter_m: float) -> None:
-    """Raise `SettingError` unless a disc can have a diameter [m]."""
-    if diameter_m > _LARGEST_DISC_M:
+    """Raise `SettingError` unless a disc's diameter is plausible [m]."""
+    if diameter_m > _MAX_DISC_M:
         raise SettingError(
             key,
             f"{diameter_m:g} m is out of range",
             f"give metres: {diameter_m:g} mm are {1e-3 * diameter_m:g}",
         )
-    require_range(key, diameter_m, 0.0, _LARGEST_DISC_M, unit="m", open_low=True)
+    require_range(key, diameter_m, 0.0, _MAX_DISC_M, unit="m", open_low=True)
 
 
 def require_hole(key: str, inner_m: float, outer_m: float) -> None:

@@ -1,6 +1,6 @@
-"""Fields without a lattice: discs that lie anywhere, on planes of their own, with or without codes.
+"""Fields without a lattice: discs anywhere, each in its own plane, with or without codes.
 
-Their frame is that of whoever surveyed them.
+Their frame is that of the survey.
 """
 
 from __future__ import annotations
@@ -25,31 +25,31 @@ from kgcp.targets.fields.layout import (
 )
 
 MOST_DISCS = 2000
-"""Of a field of points."""
+"""Largest number of discs of a field of points."""
 
-_LEAST_WIDTH = 0.02  # of its length, of a field that is no line
-_ALIKE = 0.9  # cosine of the angle between normals of discs that face the same way
-_UNIT_OFF = 1e-3  # of a normal's length
-_FARTHEST_M = 1e6
-_BITS = (6, 24)
-_MOST_RING = 10.0  # diameters of the disc
+_MIN_WIDTH = 0.02  # of a field, relative to its length; a narrower one counts as a line
+_MIN_COSINE = 0.9  # of the angle between normals of discs that face the same way
+_UNIT_TOLERANCE = 1e-3  # of a normal's length
+_MAX_COORDINATE_M = 1e6
+_BITS_RANGE = (6, 24)
+_MAX_RING_RATIO = 10.0  # diameter of a code ring, relative to that of the disc
 
 
 @dataclass(frozen=True, slots=True)
 class CodeRing:
-    """A ring of sectors around each disc, which is its code.
+    """A ring of sectors around each disc that carries its code.
 
     Attributes
     ----------
     bits : int
-        Sectors of equal size; a sector that has the disc's own brightness is a 1.
+        Number of equal sectors; a sector as bright as the disc is a 1.
     inner, outer : float
-        Diameters of the ring over that of the disc.
+        Diameters of the ring, relative to that of the disc.
 
     Raises
     ------
     SettingError
-        On making one, for what cannot be read.
+        On construction, if the ring could not be read.
     """
 
     bits: int
@@ -57,12 +57,12 @@ class CodeRing:
     outer: float
 
     def __post_init__(self) -> None:
-        require_range("bits", self.bits, *_BITS)
-        require_range("ring", self.inner, 1.2, _MOST_RING)
-        require_range("ring", self.outer, 1.1 * self.inner, _MOST_RING)
+        require_range("bits", self.bits, *_BITS_RANGE)
+        require_range("ring", self.inner, 1.2, _MAX_RING_RATIO)
+        require_range("ring", self.outer, 1.1 * self.inner, _MAX_RING_RATIO)
 
     def canonical(self, code: int) -> int:
-        """Return the least number that a turn of the ring makes of a code."""
+        """Return the smallest number that a code becomes by rotating the ring."""
         mask = (1 << self.bits) - 1
         return min(
             ((code >> turn) | (code << (self.bits - turn))) & mask for turn in range(self.bits)
@@ -77,16 +77,16 @@ class FieldPoint:
     ----------
     name : str
     position_m : (3,) tuple of float
-        Of its centre, in the field's frame [m].
+        Position of its centre in the field's frame [m].
     diameter_m, inner_diameter_m : float
-        Of the disc, and of its hole; 0: none [m].
+        Diameters of the disc and of its hole [m]; 0: no hole.
     normal : (3,) tuple of float
-        Unit vector square to it, to either side.
+        Unit normal, towards either side.
     sd_m : (3,) tuple of float or None
         Standard deviations of its coordinates [m]; None: those of the field.
     code : int or None
-        Any of the numbers that the turns of its ring of sectors make, read clockwise from the
-        front; None: it has none.
+        Number in the ring of sectors, read clockwise from the front, beginning with any sector;
+        None: no code.
     """
 
     name: str
@@ -100,7 +100,7 @@ class FieldPoint:
 
 @dataclass(frozen=True, slots=True)
 class PointField:
-    """A field of discs with coordinates of their own.
+    """A field of discs with individual coordinates.
 
     Attributes
     ----------
@@ -109,18 +109,18 @@ class PointField:
     points : tuple of FieldPoint
     polarity : FieldPolarity
     flat_sd_m : tuple of float
-        How far discs may be from where they are said to be, along x, y, z: standard deviations [m].
+        Standard deviations of the discs' stated coordinates along x, y, z [m].
     bars : tuple of FieldBar
         Measured distances.
     code : CodeRing or None
-        How codes are written; None: no disc has one.
+        Layout of the codes; None: no disc has one.
     is_diameter_stated : bool
-        Whether the diameters are known; otherwise only their ratios are meant.
+        Whether the diameters are known; otherwise only their ratios count.
 
     Raises
     ------
     SettingError
-        On making one, for what cannot be a field.
+        On construction, if the field is impossible.
     """
 
     name: str
@@ -178,36 +178,37 @@ class PointField:
                 "points", f"{names[0]} and {names[1]} overlap", "correct their places or diameters"
             )
         widths = np.linalg.svd(centres - centres.mean(axis=0), compute_uv=False)
-        if widths[1] < _LEAST_WIDTH * widths[0]:
+        if widths[1] < _MIN_WIDTH * widths[0]:
             raise SettingError(
                 "points", "lie in one row, which does not determine a camera", "add some beside it"
             )
 
     def _reaches_m(self) -> FloatArray:
-        """Return how far (m, m) centres must be apart [m].
+        """Return the least distances (m, m) of centres [m].
 
-        Codes count where two discs face the same way: across an edge they may come closer.
+        Codes count only between discs that face the same way. On both sides of an edge, discs may
+        be closer to each other.
         """
         radii, codes = self.radii_m(), self.radii_m()
         if self.code is not None:
             codes[[point.code is not None for point in self.points]] *= self.code.outer
         normals = self.normals()
-        is_alike = np.abs(normals @ normals.T) > _ALIKE
+        is_alike = np.abs(normals @ normals.T) > _MIN_COSINE
         return np.where(is_alike, codes[:, None] + codes, radii[:, None] + radii)
 
     @property
     def named_by(self) -> str:
-        """What gives the discs of a photograph their names."""
+        """How discs are identified."""
         return "places" if self.code is None else "code"
 
     @property
     def starts_from_homographies(self) -> bool:
-        """Whether photographs are first taken for those of the plane z = 0: never, of points."""
+        """Whether start values come from homographies of the plane z = 0: never for points."""
         return False
 
     @property
     def pitch_m(self) -> float:
-        """Distance of neighbours: the median [m]."""
+        """Median distance of nearest neighbours [m]."""
         return float(np.median(gaps_between(self.points_m()).min(axis=1)))
 
     def names(self) -> tuple[str, ...]:
@@ -215,15 +216,15 @@ class PointField:
         return tuple(point.name for point in self.points)
 
     def points_m(self) -> FloatArray:
-        """Return where the discs are meant to be (m, 3), in the field's frame [m]."""
+        """Return the stated positions (m, 3) of the discs, in the field's frame [m]."""
         return np.array([point.position_m for point in self.points])
 
     def point_sds_m(self) -> FloatArray:
-        """Return how far they may be from there (m, 3): standard deviations [m]."""
+        """Return the standard deviations (m, 3) of the stated positions [m]."""
         return np.array([point.sd_m or self.flat_sd_m for point in self.points])
 
     def normals(self) -> FloatArray:
-        """Return unit vectors (m, 3) square to the discs."""
+        """Return the unit normals (m, 3) of the discs."""
         return np.array([point.normal for point in self.points])
 
     def radii_m(self) -> FloatArray:
@@ -235,11 +236,11 @@ class PointField:
         return np.array([0.5 * point.inner_diameter_m for point in self.points])
 
     def symmetries(self) -> list[IndexArray]:
-        """Return no turns: discs that are named one by one have one way up."""
+        """Return no symmetries: discs that are identified one by one have only one orientation."""
         return []
 
     def with_diameters(self, scale: float) -> PointField:
-        """Return the field with all diameters multiplied, as they were measured."""
+        """Return the field with all diameters multiplied by a factor."""
         points = tuple(
             replace(
                 point,
@@ -252,11 +253,11 @@ class PointField:
 
 
 AnyField = Field | PointField
-"""What photographs are taken of."""
+"""A field with or without a lattice."""
 
 
 def gaps_between(points: FloatArray) -> FloatArray:
-    """Return the distances (m, m) of points (m, d) from each other, infinite from themselves."""
+    """Return the distances (m, m) between points (m, d); infinite on the diagonal."""
     squares = np.zeros((len(points), len(points)))
     for axis in points.T:
         squares += (axis[:, None] - axis) ** 2
@@ -266,11 +267,11 @@ def gaps_between(points: FloatArray) -> FloatArray:
 
 def _check_point(point: FieldPoint) -> None:
     where = f"of {point.name}"
-    if not all(abs(value) <= _FARTHEST_M for value in point.position_m):
+    if not all(abs(value) <= _MAX_COORDINATE_M for value in point.position_m):
         raise SettingError("position_m", f"{where} is out of range", "give it in metres")
     require_diameter(f"diameter_m {where}", point.diameter_m)
     require_hole(f"inner_diameter_m {where}", point.inner_diameter_m, point.diameter_m)
-    if abs(math.hypot(*point.normal) - 1.0) > _UNIT_OFF:
+    if abs(math.hypot(*point.normal) - 1.0) > _UNIT_TOLERANCE:
         raise SettingError(f"normal {where}", "is not of length 1", "divide it by its length")
     for sd in point.sd_m or ():
         require_range(f"sd {where}", sd, 0.0, 1.0, unit="m", open_low=True)
