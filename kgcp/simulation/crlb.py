@@ -1,8 +1,8 @@
-"""Cramér-Rao bound of one view: the least scatter any unbiased measurement of it can have.
+"""Cramér-Rao bound of one view: the least standard deviation of any unbiased measurement of it.
 
-The image model is the simulator's own (`kgcp.simulation`): exact coverage, spread by point spread
-and streak, integrated over pixels; shot and read noise, clipping, rounding. benchmarks/README.md
-says what is taken as unknown and what is left out.
+The image model is the simulator's (`kgcp.simulation`): exact coverage, blurred by point spread and
+streak, integrated over pixels; shot and read noise, clipping, rounding. benchmarks/README.md lists
+the unknowns and what is left out.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster, outline_box
 from kgcp.simulation.plate import PrintedPlate
 from kgcp.simulation.regions import DiscRegion
 
-_STEP_PX = 0.02  # of the central differences, as the largest movement of an edge
-_OPAQUE = 0.999  # share of the plate in a pixel from which the plate's outline does not matter
+_STEP_PX = 0.02  # step of the central differences, as the largest movement of an edge
+_OPAQUE = 0.999  # share of the plate in a pixel from which on the plate's outline is irrelevant
 _WHITE_LEVEL = 255.0
 
 
@@ -38,7 +38,7 @@ class Bound:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One view of a plate: how it lies, and what takes the picture."""
+    """One view of a plate: its pose, and the camera that takes the picture."""
 
     camera: Camera
     plate: PrintedPlate  # with the radiances of plate and ink
@@ -46,17 +46,17 @@ class Shot:
     optics: Optics
     sensor: Sensor
     gain: float  # exposure relative to the one at which radiance 1 fills the well
-    has_unknown_streak: bool  # whether a measurement has to find out how the image moved
-    # across the ring's window: 150 are good for 1 %, 600 for a per mille of the bound
+    has_unknown_streak: bool  # whether a measurement has to estimate the streak
+    # sub-pixels across the ring's window: with 150 the bound is right to 1 %, with 600 to 1 ‰
     sub_pixels: int = 600
 
 
 def bound_of(shot: Shot) -> Bound:
     """Return the bound of a view of the whole main ring.
 
-    Unknown besides the six of the pose: the radiances of ink and plate and the point spread; the
-    streak, where the shot says so; two parameters of the tone curve's bend, where the camera's
-    response is unknown.
+    The unknowns are the pose, the radiances of ink and plate, and the point spread. If the shot
+    says so, the streak is unknown as well. If the camera's response is unknown, two parameters of
+    the tone curve's bend are added.
     """
     equations = equations_of(shot)
     return propagated(shot, pose_bound(equations.pose, equations.nuisances))
@@ -64,18 +64,18 @@ def bound_of(shot: Shot) -> Bound:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Equations:
-    """Derivatives of what the pixels of a view observe, in units of their noise."""
+    """Derivatives of the pixels' irradiances in a view, in units of their noise."""
 
     view: View
-    white: FloatArray  # share of white in the sub-pixels, before it is spread
-    share: FloatArray  # (height, width): of white, in the pixels
+    white: FloatArray  # share of white in the sub-pixels, before blurring
+    share: FloatArray  # (height, width): share of white in the pixels
     weight: FloatArray  # (n,): of the pixels, row by row: 1 / noise of the irradiance, or less
-    pose: FloatArray  # (n, 6): by tx ty tz [m] and left rotation vector
-    nuisances: FloatArray  # (n, m)
+    pose: FloatArray  # (n, 6): derivatives by tx ty tz [m] and left rotation vector
+    nuisances: FloatArray  # (n, m): derivatives by the other unknowns
 
 
 def equations_of(shot: Shot) -> Equations:
-    """Return the equations of which `bound_of` is the solution."""
+    """Return the equations from which `bound_of` computes the bound."""
     view = View(shot, _ring_window(shot))
     white = view.white(shot.pose)
     share = view.seen(white, shot.optics)
@@ -86,7 +86,7 @@ def equations_of(shot: Shot) -> Equations:
 
 
 def pose_bound(pose: FloatArray, nuisances: FloatArray) -> FloatArray:
-    """Return the inverse (6, 6) of the information about the pose that the nuisances leave.
+    """Return the bound (6, 6) of the pose's covariance, with the nuisances estimated as well.
 
     Parameters
     ----------
@@ -104,13 +104,13 @@ def pose_bound(pose: FloatArray, nuisances: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """A window on the plate: how much white every pixel sees, 0 (ink) … 1."""
+    """A window on the plate: the share of white in every pixel, 0 (ink) … 1."""
 
     shot: Shot
     window: PixelWindow
 
     def white(self, pose: Pose) -> FloatArray:
-        """Return the share of white in the sub-pixels, on a plate without end."""
+        """Return the share of white in the sub-pixels, on an infinite plate."""
         patch = PlaneRaster.of(self.shot.camera, pose, self.window, self._oversampling)
         white = np.ones_like(patch.x_m)
         for shape, radiance in replace(self.shot.plate, black=0.0, white=1.0).print_layers():
@@ -122,12 +122,12 @@ class View:
         return optics.spread(white, self._oversampling, self.window.row)
 
     def irradiance(self, share: FloatArray) -> FloatArray:
-        """Return the light of a share of white."""
+        """Return the irradiance of pixels with a share of white."""
         plate = self.shot.plate
         return plate.black + (plate.white - plate.black) * share
 
     def opaque(self) -> BoolArray:
-        """Return where (height, width) a pixel of the frame sees nothing but the plate."""
+        """Return which pixels (height, width) are in the frame and see nothing but the plate."""
         shot, window = self.shot, self.window
         patch = PlaneRaster.of(shot.camera, shot.pose, window, self._oversampling)
         plate = np.zeros_like(patch.x_m)
@@ -146,7 +146,7 @@ class View:
 
 
 def _ring_window(shot: Shot) -> PixelWindow:
-    """Return the window with everything that the edges of the main ring send light to."""
+    """Return the window with all pixels that light from the edges of the main ring reaches."""
     edge = DiscRegion((0.0, 0.0), 0.5 * shot.plate.target.ring.outer_diameter_m)
     corner, size = outline_box(shot.camera, shot.pose, edge)
     margin = shot.optics.reach_px
@@ -158,9 +158,9 @@ def _ring_window(shot: Shot) -> PixelWindow:
 def _information(view: View, share: FloatArray) -> FloatArray:
     """Return the information (n,) of each pixel about its irradiance: 1 / variance if it is seen.
 
-    A pixel that may clip has less, that of a censored normal variable; one far above the limit
-    has none. Sharpening follows the noise and cannot add information: it is left
-    out, as JPEG is.
+    A pixel that may clip has less information, that of a censored normal variable; one far above
+    the limit has none. Sharpening acts after the noise and adds no information. It is left out, and
+    so is JPEG.
     """
     gain, sensor = view.shot.gain, view.shot.sensor
     exposure = gain * view.irradiance(share).ravel()
@@ -177,7 +177,7 @@ def censored_information(margin: FloatArray) -> FloatArray:
     Parameters
     ----------
     margin : array
-        From the mean to the limit above which only the fact of being above is seen.
+        From the mean to the limit. Above the limit, only the fact of being above is observed.
     """
     density = np.exp(-0.5 * margin * margin) / math.sqrt(2.0 * math.pi)
     log_density = -0.5 * (margin * margin + math.log(2.0 * math.pi))
@@ -188,8 +188,8 @@ def censored_information(margin: FloatArray) -> FloatArray:
 def _pose_derivatives(view: View) -> FloatArray:
     """Return the derivatives (n, 6) of the irradiance by tx ty tz [m] and left rotation vector.
 
-    Differences are taken along and across the viewing ray: a step along z would move a target
-    off the axis sideways by far more than it scales it.
+    Steps of the central differences are along and across the viewing ray. A step along z would
+    shift the image of a target off the axis by far more than it scales it.
     """
     plate, pose, optics = view.shot.plate, view.shot.pose, view.shot.optics
     radius_m = 0.5 * plate.target.ring.outer_diameter_m
@@ -209,7 +209,7 @@ def _pose_derivatives(view: View) -> FloatArray:
 
 
 def _nuisances(view: View, white: FloatArray, share: FloatArray) -> Iterator[FloatArray]:
-    """Yield the derivatives of the irradiance by everything unknown that is not the pose."""
+    """Yield the derivatives of the irradiance by all unknowns but the pose."""
     shot = view.shot
     yield share
     yield 1.0 - share

@@ -1,8 +1,8 @@
 """Photographs of fields of plain discs and rings: exact coverage through the full camera.
 
-Every circle is painted on its own plane by exact coverage of sub-pixels, shaded by the light, and
-spread over pixels; light adds up, so that the circles may touch. Nothing here is shared with the
-model that measures them.
+Every circle is painted on its own plane by exact coverage of sub-pixels, multiplied by the light,
+and blurred over pixels. The light of all circles is added up, so that circles may touch. No code is
+shared with the model that measures them.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster, outline_box
 from kgcp.simulation.regions import AnnularSector, ConvexPolygon, DiscRegion, Region
 
-_SUB_PIXELS_ACROSS = 1200  # of a window
-_FEWEST_SUB_PIXELS, _MOST_SUB_PIXELS = 4, 10  # per pixel and axis
+_SUB_PIXELS_ACROSS = 1200  # sub-pixels along the longer side of a window
+_MIN_SUB_PIXELS, _MAX_SUB_PIXELS = 4, 10  # limits per pixel and axis
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,8 +31,8 @@ class SimulatedDisc:
 
     position_m: tuple[float, float, float]  # of its centre [m]
     diameter_m: float
-    inner_diameter_m: float = 0.0  # of a hole in it; 0: none
-    # unit vector square to it; the field's own z axis by default, which points into the board
+    inner_diameter_m: float = 0.0  # diameter of its hole; 0: no hole
+    # unit normal; by default the field's z axis, which points into the board
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
     code: DiscCode | None = None  # sectors of ink around it
 
@@ -65,7 +65,7 @@ class FieldScene:
     ink: float = 0.06
     gradient: tuple[float, float] = (0.0, 0.0)  # change of light along x and y, relative [1/px]
     # edges of the board in the field's plane z = 0: x and y of one corner and of the opposite one
-    # [m]; None: the ground is everywhere
+    # [m]; None: the board is infinite
     board_m: tuple[float, float, float, float] | None = None
     surround: float = 0.3  # radiance beyond the board
 
@@ -98,9 +98,9 @@ def photograph(
 
 
 def field_irradiance(camera: Camera, pose: Pose, scene: FieldScene, optics: Optics) -> FloatArray:
-    """Return the light (height, width) of a field in all pixels, without noise.
+    """Return the irradiance (height, width) of all pixels by a field, without noise.
 
-    What is not wholly in front of the camera is left out.
+    Discs that are not wholly in front of the camera are left out.
     """
     columns, rows = np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float)
     frame = _board(camera, pose, scene, optics)
@@ -120,7 +120,7 @@ def field_irradiance(camera: Camera, pose: Pose, scene: FieldScene, optics: Opti
 
 
 def disc_pose(pose: Pose, disc: SimulatedDisc) -> Pose:
-    """Return the pose of a disc's plane, disc → camera, for that of its field."""
+    """Return the pose of a disc's plane (disc → camera) from that of its field."""
     circle = field_circles(pose, [disc])
     axes = circle.axes[0]
     rotation = np.column_stack((axes, np.cross(axes[:, 0], axes[:, 1])))
@@ -128,7 +128,7 @@ def disc_pose(pose: Pose, disc: SimulatedDisc) -> Pose:
 
 
 def field_circles(pose: Pose, discs: Sequence[SimulatedDisc]) -> Circles3D:
-    """Return the outer circles of discs in the camera frame, for the field's pose."""
+    """Return the outer circles of discs in the camera frame, from the field's pose."""
     positions = np.array([disc.position_m for disc in discs], dtype=np.float64)
     normals = np.array([disc.normal for disc in discs], dtype=np.float64)
     radii_m = np.array([0.5 * disc.diameter_m for disc in discs])
@@ -136,7 +136,7 @@ def field_circles(pose: Pose, discs: Sequence[SimulatedDisc]) -> Circles3D:
 
 
 def _board(camera: Camera, pose: Pose, scene: FieldScene, optics: Optics) -> FloatArray | None:
-    """Return the frame with the bare board; None where it has no end."""
+    """Return the frame with the bare board; None if the board is infinite."""
     if scene.board_m is None:
         return None
     left, top, right, bottom = scene.board_m
@@ -156,12 +156,12 @@ def _add(
     scene: FieldScene,
     optics: Optics,
 ) -> None:
-    """Add the first shape, less the others, to a frame's light."""
+    """Add the light of the first shape without the others to a frame, in place."""
     window = _window(camera, plane, shapes[0], optics)
     if window.width <= 0 or window.height <= 0:
         return
     longest = max(window.width, window.height)
-    oversampling = int(np.clip(_SUB_PIXELS_ACROSS // longest, _FEWEST_SUB_PIXELS, _MOST_SUB_PIXELS))
+    oversampling = int(np.clip(_SUB_PIXELS_ACROSS // longest, _MIN_SUB_PIXELS, _MAX_SUB_PIXELS))
     raster = PlaneRaster.of(camera, plane, window, oversampling)
     covered = np.zeros_like(raster.x_m)
     for number, shape in enumerate(shapes):
@@ -180,7 +180,7 @@ def _add(
 
 
 def _window(camera: Camera, plane: Pose, shape: Region, optics: Optics) -> PixelWindow:
-    """Return the window with all that a shape sends light to, as far as it is near the frame."""
+    """Return the window with all pixels in or near the frame that light from a shape reaches."""
     corner, size = outline_box(camera, plane, shape)
     margin = optics.reach_px + 1
     column, row = np.floor(corner).astype(int) - margin

@@ -1,7 +1,7 @@
-"""A number or two for each effect of real light: how strong it is in a simulated flight.
+"""Strengths of the effects of real light and cameras in a simulated flight, in one or two numbers.
 
-Without the effect they are neutral: 1 for the share of the light that is left and for the ratio of
-the astigmatism, 0 for all others. The exposure is never without effect.
+The neutral value is 1 for the share of light behind a shadow and for the ratio of astigmatism, and
+0 for all others. The exposure has no neutral value.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from kgcp.simulation.point_spread import Aberration
 from kgcp.simulation.presets import SimulationSettings, preset
 from kgcp.simulation.rolling_shutter import ImageMotion
 
-_LEAST_PEAK = 1.0 / 3.0  # of the largest peak of highlights
+_MIN_PEAK_RATIO = 1.0 / 3.0  # of the smallest to the largest peak of highlights
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class Effects:
 
     # range of the exposure, relative to the one at which radiance 1 fills the well
     gain: tuple[float, float] = (0.7, 1.0)
-    shadow: float = 1.0  # share of the light that is left behind a shadow edge; 1: no edge
+    shadow: float = 1.0  # share of the light that remains behind a shadow edge; 1: no edge
     stripes: int = 0  # number of stripe-shaped shadows
     dirt: float = 0.0  # relative standard deviation of the reflectance
     stains: int = 0  # number of stains
@@ -33,14 +33,14 @@ class Effects:
     coma: float = 0.0  # third central moment of the point spread along its tail, over psf³
     defocus: float = 0.0  # radius of the disc that a point becomes by defocus [px]
     sharpening: tuple[float, float] = (0.0, 1.0)  # strength of the unsharp mask, and its σ [px]
-    phone: bool = False  # whether frames are processed as a phone does it
+    phone: bool = False  # whether frames are processed as by a phone
     rolling: float = 0.0  # time from the first row to the last [s]
     # motion of the image during that time [px/s]; None: random, anew in each frame
     motion: tuple[float, float] | None = None
 
     @classmethod
     def of(cls, settings: SimulationSettings) -> Effects:
-        """Return the figures of a flight's settings."""
+        """Return the strengths in a flight's settings."""
         shadow = settings.shadow or Shadow(edges=0)
         dirt = settings.dirt or Dirt(sd=0.0, stains=0)
         lens = settings.lens or Aberration()
@@ -69,18 +69,18 @@ def with_phone(settings: SimulationSettings, *, is_phone: bool) -> SimulationSet
 def with_effects(settings: SimulationSettings, wanted: Effects) -> SimulationSettings:
     """Return a flight's settings with other strengths of some effects.
 
-    Everything else about an effect stays as it is in the settings or, where they do not have the
-    effect, as it is by default.
+    Other parameters of an effect keep the value in the settings, or get their default if the
+    settings lack the effect.
     """
-    had = Effects.of(settings)
+    present = Effects.of(settings)
     settings = replace(settings, gain=wanted.gain)
-    if (wanted.shadow, wanted.stripes) != (had.shadow, had.stripes):
+    if (wanted.shadow, wanted.stripes) != (present.shadow, present.stripes):
         settings = replace(settings, shadow=_shadow(settings.shadow, wanted))
-    if (wanted.dirt, wanted.stains) != (had.dirt, had.stains):
+    if (wanted.dirt, wanted.stains) != (present.dirt, present.stains):
         dirt = replace(settings.dirt or Dirt(), sd=wanted.dirt, stains=wanted.stains)
         settings = replace(settings, dirt=dirt)
-    if wanted.glare != had.glare:
-        peak = (_LEAST_PEAK * wanted.glare, wanted.glare)
+    if wanted.glare != present.glare:
+        peak = (_MIN_PEAK_RATIO * wanted.glare, wanted.glare)
         settings = replace(settings, glare=replace(settings.glare or Glare(), peak=peak))
     lens = replace(
         settings.lens or Aberration(),
@@ -90,23 +90,23 @@ def with_effects(settings: SimulationSettings, wanted: Effects) -> SimulationSet
     )
     if lens != (settings.lens or Aberration()):
         settings = replace(settings, lens=lens)
-    if wanted.phone != had.phone:
+    if wanted.phone != present.phone:
         settings = _as_of_a_phone(settings) if wanted.phone else replace(settings, phone=None)
-    if wanted.sharpening != had.sharpening:
+    if wanted.sharpening != present.sharpening:
         settings = _sharpened(settings, *wanted.sharpening)
-    if wanted.rolling != had.rolling:
+    if wanted.rolling != present.rolling:
         camera = replace(settings.camera, readout_s=wanted.rolling)
         settings = replace(settings, camera=camera)
-    if wanted.motion != had.motion:
+    if wanted.motion != present.motion:
         motion = ImageMotion() if wanted.motion is None else ImageMotion(wanted.motion, 0.0)
         settings = replace(settings, motion=motion)
     return settings
 
 
 def _shadow(shadow: Shadow | None, wanted: Effects) -> Shadow:
-    """Return a shadow with an edge unless all light is left, and with stripes.
+    """Return a shadow with the wanted stripes, and with an edge unless all light remains.
 
-    The light that is left behind stripes alone is that of the settings, or of `Shadow`.
+    Without an edge, the light in stripes is that of the settings, or the default of `Shadow`.
     """
     shadow = replace(shadow or Shadow(), stripes=wanted.stripes)
     if wanted.shadow == 1.0:
@@ -128,7 +128,7 @@ def _as_of_a_phone(settings: SimulationSettings) -> SimulationSettings:
 def _sharpened(
     settings: SimulationSettings, strength: float, sharpening_px: float
 ) -> SimulationSettings:
-    """Return a camera that sharpens, of which nobody states a linear response then."""
+    """Return settings with sharpening; nobody would state a linear response for such a camera."""
     sensor = replace(settings.sensor, sharpening=strength, sharpening_px=sharpening_px)
     camera = settings.camera
     if strength > 0.0 and camera.response is Response.LINEAR:

@@ -1,4 +1,4 @@
-"""A session of photographs of a field of targets: printed, lit and photographed from all sides."""
+"""Simulated photographs of a printed and lit field of targets from many directions."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from kgcp.simulation.phone import Phone
 from kgcp.targets.fields.layout import Field, FieldPolarity
 from kgcp.targets.fields.points import AnyField, CodeRing, FieldPoint, PointField
 
-_BORDER = 0.6  # of the pitch, from the outer discs' edges to that of the board
+_BORDER = 0.6  # from the outer discs' edges to that of the board, relative to the pitch
 _PAPER, _INK = 0.8, 0.06  # radiance
 _TILT_DEG = (15.0, 40.0)
-_FARTHER = (1.03, 1.45)  # than where the board would fill the frame
+_DISTANCE_RATIO = (1.03, 1.45)  # relative to the distance at which the board fills the frame
 _TURN_SD_DEG = 6.0
-_EVERY_TURNED = 3  # photograph, by 90°
-_ROUNDS = 60  # in which place and distance are found
+_TURNED_PERIOD = 3  # every third photograph is turned by 90°
+_ROUNDS = 60  # attempts to place the board in the frame
 _MARGIN_PX = 4.0
 _OPTICS, _SENSOR = Optics(0.7), Sensor()
 
 
 @dataclass(frozen=True, slots=True)
 class FieldSession:
-    """What is photographed, with what, and how often."""
+    """Settings of the photographs."""
 
-    camera: Camera  # the truth that a calibration is to find
-    field: AnyField  # what is meant to be: the discs are off by `point_sds_m`, at random
+    camera: Camera  # the true camera, which a calibration has to recover
+    field: AnyField  # as stated; printed discs deviate at random by `point_sds_m`
     photographs: int = 14
     optics: Optics = _OPTICS
     sensor: Sensor = _SENSOR
     gain: float = 1.0  # exposure relative to the one at which radiance 1 fills the well
-    fall: float = 0.15  # of the light across half the frame's width, in random directions
-    # whether the board ends; the ground is everywhere if not, which is rendered sooner, and around
-    # fields of points, which have no board
+    # largest decrease of the light over half the frame's width; its amount and direction are random
+    fall: float = 0.15
+    # whether the board has edges; without them, rendering is faster. Fields of points never have.
     has_edges: bool = True
-    phone: Phone | None = None  # makes a photograph of the light; None: the sensor alone
+    phone: Phone | None = None  # image processing; None: only the sensor's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,9 +53,9 @@ class FieldPhotograph:
 
 
 def printed_points(session: FieldSession, rng: np.random.Generator) -> FloatArray:
-    """Return where the discs are on the board (m, 3), in the field's frame [m]."""
-    meant = session.field.points_m()
-    return np.asarray(meant + session.field.point_sds_m() * rng.standard_normal(meant.shape))
+    """Return the true positions of the printed discs (m, 3), in the field's frame [m]."""
+    stated = session.field.points_m()
+    return np.asarray(stated + session.field.point_sds_m() * rng.standard_normal(stated.shape))
 
 
 def field_photograph(
@@ -81,12 +81,13 @@ def field_photograph(
 
 
 def _discs(field: AnyField, points_m: FloatArray) -> tuple[SimulatedDisc, ...]:
-    """Return the discs of a field where they are (m, 3)."""
+    """Return the discs of a field at their true positions (m, 3)."""
     codes: list[DiscCode | None] = [None] * len(points_m)
     if isinstance(field, PointField) and field.code is not None:
         codes = [_code(point, field.code) for point in field.points]
     normals = field.normals()
-    normals = np.where(normals[:, 2:] < 0.0, -normals, normals)  # into the board: codes turn by it
+    # normals must point into the board, because they define the sense of the codes
+    normals = np.where(normals[:, 2:] < 0.0, -normals, normals)
     return tuple(
         SimulatedDisc((x, y, z), 2.0 * outer, 2.0 * hole, (u, v, w), code)
         for (x, y, z), (u, v, w), outer, hole, code in zip(
@@ -125,20 +126,20 @@ def _board_m(board: AnyField) -> tuple[float, float, float, float]:
 
 
 def _pose(camera: Camera, corners: FloatArray, number: int, rng: np.random.Generator) -> Pose:
-    """Return a pose that shows all corners (n, 3), tilted, somewhere in the frame."""
+    """Return a tilted pose with all corners (n, 3) in the frame, at a random place."""
     middle = corners.mean(axis=0)
-    quarter = 90.0 if number % _EVERY_TURNED == _EVERY_TURNED - 1 else 0.0
+    quarter = 90.0 if number % _TURNED_PERIOD == _TURNED_PERIOD - 1 else 0.0
     turn = math.radians(quarter + _TURN_SD_DEG * rng.standard_normal())
     tilt, about = math.radians(rng.uniform(*_TILT_DEG)), rng.uniform(0.0, 2.0 * math.pi)
     axis = np.array((math.cos(about), math.sin(about), 0.0))
     rotation = rotation_about(tilt * axis) @ rotation_about(np.array((0.0, 0.0, turn)))
     around = (corners - middle) @ rotation.T
-    distance_m = _fitting_distance_m(camera, around) * rng.uniform(*_FARTHER)
+    distance_m = _fitting_distance_m(camera, around) * rng.uniform(*_DISTANCE_RATIO)
     aside = rng.uniform(-0.5, 0.5, 2) * np.array((camera.width, camera.height))
     centre_px = 0.5 * np.array((camera.width - 1, camera.height - 1))
     for step in range(_ROUNDS):
-        seen = camera.undistort(centre_px + aside * (1.0 - step / _ROUNDS))
-        translation = distance_m * np.array((*seen, 1.0))
+        place = camera.undistort(centre_px + aside * (1.0 - step / _ROUNDS))
+        translation = distance_m * np.array((*place, 1.0))
         if _is_in_frame(camera, around + translation):
             break
     else:
@@ -147,7 +148,7 @@ def _pose(camera: Camera, corners: FloatArray, number: int, rng: np.random.Gener
 
 
 def _fitting_distance_m(camera: Camera, around: FloatArray) -> float:
-    """Return the least distance, but for a few per cent, at which the frame shows all corners."""
+    """Return the least distance at which the frame shows all corners, to a few per cent."""
     axis = np.array((*camera.undistort(0.5 * np.array((camera.width, camera.height))), 1.0))
     far_m = 100.0 * float(np.linalg.norm(around, axis=1).max())
     near_m = float(np.linalg.norm(around, axis=1).max())
@@ -161,7 +162,7 @@ def _fitting_distance_m(camera: Camera, around: FloatArray) -> float:
 
 
 def _is_in_frame(camera: Camera, corners: FloatArray) -> bool:
-    """Tell whether corners and the middles between one and the next are in the frame."""
+    """Tell whether all corners and the midpoints between neighbours are in the frame."""
     outline = np.vstack((corners, 0.5 * (corners + np.roll(corners, 1, axis=0))))
     if outline[:, 2].min() <= 0.0:
         return False

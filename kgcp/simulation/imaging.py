@@ -70,7 +70,7 @@ class ToneCurve(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """Everything that spreads the light of one frame."""
+    """Blur of one frame: point spread, streak and motion during the readout."""
 
     # σ of the Gaussian point spread; with an aberration, the root of the product of the largest and
     # the smallest [px]
@@ -93,7 +93,7 @@ class Optics:
         """Blur a scene given on sub-pixels and integrate it over pixels.
 
         The transfer functions of point spread and streak are applied exactly, in the frequency
-        domain; the scene goes on beyond its border as at the border.
+        domain. Beyond its border, the scene continues with the values at the border.
 
         Parameters
         ----------
@@ -166,7 +166,7 @@ class Sensor:
         return np.rint(self.develop(exposure)).astype(np.uint8)
 
     def collect(self, exposure: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Return what the pixels read of an exposure ≥ 0: with noise, clipped to 0…1."""
+        """Return exposures ≥ 0 as the pixels record them: with noise, clipped to 0…1."""
         deviation = np.sqrt(self.full_well_e * exposure + self.read_noise_e**2) / self.full_well_e
         noisy = exposure + deviation * rng.standard_normal(exposure.shape)
         return np.clip(noisy, 0.0, 1.0, out=noisy)

@@ -1,10 +1,10 @@
-"""Light that is not the same everywhere on a plate: shade, dirt, stains, a highlight.
+"""Uneven light on a plate: shade, dirt, stains, a highlight.
 
-A place of the plate that was printed with radiance L sends out
+A place of the plate that was printed with radiance L has the radiance
 
-    L · (share of the light that reaches it) · (reflectance against a clean print) + highlight,
+    L · (share of the light that reaches it) · (reflectance relative to a clean print) + highlight,
 
-in linear light, before point spread and exposure. Shade and dirt act on ink and white alike, a
+in linear light, before point spread and exposure. Shade and dirt act on ink and white alike, and a
 highlight is added to both.
 """
 
@@ -20,14 +20,15 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.simulation.light_settings import Dirt, Glare, Shadow
 from kgcp.simulation.plane_raster import PlaneRaster
 
-_REACH_M = 0.9  # of the plate's corners from its centre
-_EDGE_REACH_M = 0.45  # shadow edges pass the centre within this: they meet the ring
+_REACH_M = 0.9  # largest distance of the plate's corners from its centre
+_EDGE_REACH_M = 0.45  # largest distance of shadow edges from the centre: they cross the ring
 _STRIPE_REACH_M = 0.4
 _HIGHLIGHT_REACH_M = 0.45
-_FAR_M = 100.0  # width of a shade that has one edge only
-_CELLS_PER_LENGTH = 3.0  # of the dirt's lattice: cubic interpolation is then good to 1 %
-_LEAST_REFLECTANCE = 0.05
-_STAIN_SOFTNESS = 0.3  # of its radius, on either side of its outline
+_FAR_M = 100.0  # width of a shade with a single edge
+# Cells of the dirt's lattice per correlation length. Cubic interpolation is then accurate to 1 %.
+_CELLS_PER_LENGTH = 3.0
+_MIN_REFLECTANCE = 0.05
+_STAIN_SOFTNESS = 0.3  # width of the transition on either side of the outline, over the radius
 _GAUSS_POINTS, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(4)  # per side of a sub-pixel
 
 
@@ -49,7 +50,7 @@ class Shade:
         return 1.0 - hidden
 
     def _risen(self, distance_m: FloatArray) -> FloatArray:
-        """Return the share of a uniform disc that is above a straight horizon."""
+        """Return the share of a uniform disc above a straight horizon."""
         height = distance_m * (2.0 / self.penumbra_m)
         share = (height > 0.0).astype(np.float64)
         soft = np.nonzero(np.abs(height) < 1.0)
@@ -61,7 +62,7 @@ class Shade:
 
 @dataclass(frozen=True, slots=True)
 class Stain:
-    """A round stain: centre and radius [m], share of the light that it takes."""
+    """A round stain: centre and radius [m], share of the light that it absorbs."""
 
     centre_m: tuple[float, float]
     radius_m: float
@@ -96,23 +97,23 @@ class Cloud:
         return cls(1.0 + noise, cell_m)
 
     def reflectance(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
-        """Return the reflectance at places on the plate, against that of a clean one."""
+        """Return the reflectance at places on the plate, relative to a clean one."""
         middle = 0.5 * (len(self.lattice) - 1)
         places = np.stack((y_m / self.cell_m + middle, x_m / self.cell_m + middle))
         interpolated = map_coordinates(self.lattice, places, order=3, mode="nearest")
-        return np.asarray(np.maximum(interpolated, _LEAST_REFLECTANCE))
+        return np.asarray(np.maximum(interpolated, _MIN_REFLECTANCE))
 
 
 @dataclass(frozen=True, slots=True)
 class Highlight:
-    """A Gaussian highlight: middle and σ [m], and the radiance that it adds in its middle."""
+    """A Gaussian highlight: centre and σ [m], and the radiance that it adds at its centre."""
 
     centre_m: tuple[float, float]
     radius_m: float
     radiance: float
 
     def added(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
-        """Return the radiance that is added at places on the plate."""
+        """Return the added radiance at places on the plate."""
         dx, dy = x_m - self.centre_m[0], y_m - self.centre_m[1]
         added: FloatArray = np.exp((dx * dx + dy * dy) * (-0.5 / self.radius_m**2))
         return self.radiance * added
@@ -122,7 +123,7 @@ class Highlight:
 class PlateLight:
     """The light on one plate in one frame, in the plate's axes."""
 
-    light_left: float = 1.0  # share of the light where every ray of the sun is hidden
+    light_left: float = 1.0  # share of the light in full shade
     shades: tuple[Shade, ...] = ()
     stains: tuple[Stain, ...] = ()
     cloud: Cloud | None = None
@@ -137,7 +138,7 @@ class PlateLight:
         gain: float,
         rng: np.random.Generator,
     ) -> PlateLight:
-        """Draw the light of one frame; `gain` is its exposure, to which a highlight refers."""
+        """Draw the light of one frame; `gain` is its exposure, to which highlights are relative."""
         return cls(
             1.0 if shadow is None else shadow.light_left,
             () if shadow is None else _cast_shades(shadow, rng),
@@ -147,16 +148,16 @@ class PlateLight:
         )
 
     def shine_on(self, patch: PlaneRaster, painted: FloatArray, opacity: FloatArray) -> FloatArray:
-        """Return the radiance of sub-pixels that send out `painted` under uniform light.
+        """Return the radiance of sub-pixels under this light.
 
         Parameters
         ----------
         patch : PlaneRaster
             Of the plate.
         painted : array
-            Mean radiance of the sub-pixels.
+            Mean radiance of the sub-pixels under uniform light.
         opacity : array
-            Share of the plate in them.
+            Share of the plate in the sub-pixels.
         """
         light = self.share(patch)
         light = painted * light + _share_of_edges(painted, light)
@@ -165,9 +166,9 @@ class PlateLight:
         return light
 
     def share(self, patch: PlaneRaster) -> FloatArray:
-        """Return how much light the sub-pixels of a patch send back, against a clean lit print.
+        """Return the light from the sub-pixels of a patch, relative to a clean and fully lit print.
 
-        Means over the sub-pixels: where shade or a stain begins, they are integrated.
+        These are means over the sub-pixels, integrated where shade or a stain begins.
         """
         x_m, y_m = patch.x_m, patch.y_m
         share = self._sharp_share(x_m, y_m)
@@ -188,7 +189,7 @@ class PlateLight:
         return share
 
     def _sharp_share(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
-        """Return the share of light that shade and stains leave at places on the plate."""
+        """Return the share of light at places on the plate, by shade and stains."""
         share = np.ones_like(x_m)
         for shade in self.shades:
             share *= shade.sunlight(x_m, y_m)
@@ -199,12 +200,12 @@ class PlateLight:
 
 
 def _share_of_edges(painted: FloatArray, light: FloatArray) -> FloatArray:
-    """Return what the mean of painted · light exceeds the product of their means by.
+    """Return the mean of painted · light minus the product of their means.
 
-    It matters in sub-pixels through which an edge of the print goes while the light changes
-    within them. With the share S beyond a straight edge of unit normal n, S (1 − S) n / 2 is the
-    first moment of that side in a unit square: exact where the edge is parallel to a side, 6 % too
-    large at 45°. The levels on both sides are those of the neighbouring sub-pixels.
+    The difference matters in sub-pixels with an edge of the print in which the light varies. Let S
+    be the share beyond a straight edge with unit normal n. The first moment of that side in a unit
+    square is about S (1 − S) n / 2: exact if the edge is parallel to a side, 6 % too large at 45°.
+    The levels on both sides are taken from the neighbouring sub-pixels.
     """
     light_down, light_across = _steps(light)
     excess = np.zeros_like(painted)

@@ -1,9 +1,9 @@
-"""What to expect of a target from some height: whether it is found, and how accurately.
+"""Expected detection and accuracy of a target from a given height.
 
 The image model is the simulator's: a tilted plate in the middle of the image, well exposed, with
-the full well and read noise of `Sensor`. Its Cramér-Rao bound times the scatter that kgcp has over
-it, as measured on simulated flights, is what to expect of one frame; calibration and print come on
-top of that.
+the full well and read noise of `Sensor`. The expected accuracy of one frame is its Cramér-Rao bound
+times the ratio of kgcp's errors to the bound, as measured on simulated flights. Errors of
+calibration and print are given separately.
 """
 
 from __future__ import annotations
@@ -37,54 +37,62 @@ if TYPE_CHECKING:
     from scipy.interpolate import PchipInterpolator
 
 TILT_DEG = 6.0
-"""Tilt of the plate against the viewing ray: more hardly matters, frontal views are better."""
+"""Tilt of the plate against the viewing ray. Larger tilts hardly matter; frontal views are more
+accurate."""
 GAIN = 0.85
 """Exposure relative to the one at which a perfect white clips."""
 SCATTER = {True: (1.0, 1.1), False: (1.4, 1.2)}
-"""RMS error over bound, of distance and centre, by whether the camera's response is linear.
+"""Ratio of the RMS error to the bound, for distance and centre. The key is whether the camera's
+response is linear.
 
-`python -m benchmarks.accuracy.planning`: 0.98 and 1.08 of 55 targets in clean, exposure_sweep,
-blurred, oblique and far; 1.37 and 1.22 of 38 in consumer (tone curve, sharpening, JPEG), which are
-11 of seed 1 and 27 of `--flights 30 --seed 2`.
+`python -m benchmarks.accuracy.planning` measured 0.98 and 1.08 on 55 targets of the flights clean,
+exposure_sweep, blurred, oblique and far. It measured 1.37 and 1.22 on 38 targets of consumer (tone
+curve, sharpening, JPEG): 11 with seed 1, and 27 with `--flights 30 --seed 2`.
 """
 FOUND = ((6.0, 52, 52), (7.0, 54, 54), (8.0, 44, 44), (9.0, 300, 300))
-"""Radius from which on [px], rings found, rings shown.
+"""Per band of radii: lower limit [px], number of rings found, number of rings shown.
 
-`python -m benchmarks.accuracy.planning`, seed 1, 150 frames each of the sets small, middle and
-large.
+From `python -m benchmarks.accuracy.planning` with seed 1 and 150 frames in each of the sets small,
+middle and large.
 """
 PLAIN_SCATTER = (1.7, 1.15)
-"""The same of plain discs, over their edges' bound with known blur.
+"""Ratios as `SCATTER`, for plain discs, to the bound of their edges with known blur.
 
-`python -m benchmarks.ground.plain_targets`: white and black discs of 3 to 20 px, linear response.
+From `python -m benchmarks.ground.plain_targets`: white and black discs of 3 to 20 px, linear
+response.
 """
 PLAIN_FOUND = (2035, 2040)
-"""Plain discs and rings found and shown from the smallest radius on, by
-`benchmarks.ground.plain_targets`: 537 of 540 of 2.5 to 3.5 px, 1498 of 1500 of 3 to 20 px."""
-PLAIN_GAP_PX, PLAIN_HOLE_PX = 2.0, 1.0
-"""Least distance of a ring's circles, and least radius of its innermost [px].
+"""Numbers of plain discs and rings found and shown, from the smallest radius on.
 
-Thinner rings are found as well, but their edges say less than edges apart.
+From `benchmarks.ground.plain_targets`: 537 of 540 with 2.5 to 3.5 px, 1498 of 1500 with 3 to 20 px.
+"""
+PLAIN_GAP_PX, PLAIN_HOLE_PX = 2.0, 1.0
+"""Least distance between a plain ring's circles, and least radius of its innermost one [px].
+
+Thinner rings are found as well, but edges so close together are less informative.
 """
 SURE_PX = 9.0
-"""Radius to plan for [px]: below, blur that is not foreseen leaves little of the dots."""
+"""Least radius to plan for [px]. In smaller rings, unforeseen blur leaves little of the dots."""
 _SHARP_PSF, _SHARP_STREAK = 0.2, 0.5
-"""Point spread and streak of a ring's radius, each alone, up to which its dots are told.
+"""Largest point spread and streak, relative to a ring's radius, at which its dots are recognised.
 
-Of 32 rendered rings of 9 to 40 px each, 31 are found at a point spread of 0.18, 29 at 0.21 and 18
-at 0.27; all with a streak of 0.5, 26 at 0.6, and none at 0.8.
+Each was tested alone, with 32 rendered rings of 9 to 40 px at each value. At point spreads of 0.18,
+0.21 and 0.27, 31, 29 and 18 rings were found. At streaks of 0.5, 0.6 and 0.8, 32, 26 and none were.
 """
-_SHARP_EDGE = 0.5  # spread of a plain disc's edge, of its radius, up to which it is no smooth blob
+# Largest spread of a plain disc's edge, relative to its radius. Beyond, the disc is a smooth blob.
+_SHARP_EDGE = 0.5
 LARGEST_SHARE = 0.46
-"""Largest radius that was tried, of the image's shorter side."""
-_RADII_PX = (6.0, 9.0, 20.0, 45.0)  # where the bound is computed
-_SPAN = 50.0
-_ROUND = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
+"""Largest radius that was tested, relative to the image's shorter side."""
+_RADII_PX = (6.0, 9.0, 20.0, 45.0)  # radii for which the bound is computed
+_MAX_HEIGHT_RATIO = 50.0  # of the largest to the smallest proposed height
+_ROUND_STEPS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)  # round heights within a decade
 OBLIQUE_DEG = 30.0
 """Angle between normal and viewing ray for which the eccentricity is given [deg]."""
 
-_WAYS_DEG = (35.0, 125.0)  # of tilt and streak: small rings feel where their dots are
-_OFF_PX = 0.3  # the centre is not a pixel's
+# Directions of tilt and streak over which the bound is averaged. For small rings, it matters where
+# the dots are.
+_DIRECTIONS_DEG = (35.0, 125.0)
+_CENTRE_OFFSET_PX = 0.3  # of the target from the middle of a pixel
 _SUB_PIXELS = 150
 
 
@@ -92,7 +100,7 @@ _SUB_PIXELS = 150
 class Conditions:
     """Conditions under which the frames will be taken."""
 
-    blur_px: float = 1.0  # motion of the image during the exposure, at most [px]
+    blur_px: float = 1.0  # largest motion of the image during the exposure [px]
     exposure_s: float = 0.001
     psf_px: float = 0.7  # σ of the point spread of lens and sensor [px]
     accuracy_percent: float = 0.05  # wanted standard deviation of one distance [% of it]
@@ -123,24 +131,24 @@ class Outlook:
     """Expected detection and accuracy at one height."""
 
     height_m: float  # camera above target
-    ring: str | None  # the largest ring that is wholly in the image; None: none is
-    radius_px: float  # of that ring, or of the main one [px]
-    # probability that it is found, and Wilson's interval of 95 %
+    ring: str | None  # the largest ring that fits into the image; None: none does
+    radius_px: float  # of that ring, or else of the main ring [px]
+    # probability of detection, and its 95 % interval (Wilson)
     found: float
     found_low: float
     found_high: float
-    # standard deviations of one frame, of the centre per axis; None where nothing is found
+    # standard deviations of one frame, for the centre per axis; None if nothing is found
     sd_distance_m: float | None
     sd_centre_px: float | None
-    # of calibration and print, in all frames alike; None: flight.toml does not say
+    # by calibration and print, the same in all frames; None: flight.toml does not state them
     sd_common_distance_m: float | None
-    # over ground, relative to the target, that blurs by no more than `blur_px`
+    # largest speed relative to the target at which motion blurs by at most `blur_px`
     largest_speed_mps: float
-    # of the main ring, for the wanted accuracy, and to be found for sure
+    # of the main ring, for the wanted accuracy and certain detection
     smallest_diameter_m: float
     gsd_m: float  # size of a pixel on the ground
-    footprint_m: tuple[float, float]  # of the image on the ground: its width and height
-    # in which the main ring is whole while the camera passes along the image's height
+    footprint_m: tuple[float, float]  # width and height of the image on the ground
+    # number of frames with the whole main ring while the camera passes along the image's height
     frames_per_pass: float
     # offset of the centre of the ring's ellipse, in the middle of the image and at `OBLIQUE_DEG`
     eccentricity_px: float
@@ -148,10 +156,11 @@ class Outlook:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Accuracy:
-    """Standard deviations by radius: smooth in logarithms, and by their laws beyond.
+    """Standard deviations as functions of a ring's radius R.
 
-    Edges of a ring of radius R are seen by about R pixels. So the deviation of the radius, and of
-    the centre, falls with R^(-1/2) and that of the distance, relative, with R^(-3/2).
+    About R pixels see the edges of the ring. So the standard deviations of radius and centre are
+    proportional to R^(-1/2), and the relative one of the distance to R^(-3/2). The factors are
+    interpolated in logarithms between the computed radii, and constant beyond them.
     """
 
     log_distance: PchipInterpolator
@@ -166,7 +175,7 @@ class _Accuracy:
         return _at(self.log_centre, radius_px) / math.sqrt(radius_px)
 
     def radius_for(self, relative_distance: float) -> float:
-        """Return the least radius at which the distance is so accurate [px]."""
+        """Return the least radius for a relative standard deviation of the distance [px]."""
         low, high = math.log(1.0), math.log(1e5)
         for _ in range(60):
             middle = 0.5 * (low + high)
@@ -184,7 +193,8 @@ def _at(logarithm: PchipInterpolator, radius_px: float) -> float:
 def usual_heights(camera: Camera, target: AnyTarget) -> tuple[float, ...]:
     """Return round heights from which some ring of a target can be measured [m].
 
-    They span a factor of fifty at most: a replica can be measured from nearer than any flight.
+    Their range is limited to a factor of fifty, because a replica can be measured from closer than
+    anybody flies.
     """
     if isinstance(target, PlainTarget):
         diameters_m, least_px = [target.outer_diameter_m], least_plain_px(target)
@@ -193,9 +203,9 @@ def usual_heights(camera: Camera, target: AnyTarget) -> tuple[float, ...]:
     px_m = [0.5 * diameter_m * camera.mean_focal_px for diameter_m in diameters_m]
     farthest = max(px_m) / least_px
     nearest = min(px_m) / (LARGEST_SHARE * min(camera.width, camera.height))
-    nearest = max(nearest, farthest / _SPAN)
+    nearest = max(nearest, farthest / _MAX_HEIGHT_RATIO)
     decades = range(math.floor(math.log10(nearest)), math.ceil(math.log10(farthest)) + 1)
-    heights = (step * 10.0**decade for decade in decades for step in _ROUND)
+    heights = (step * 10.0**decade for decade in decades for step in _ROUND_STEPS)
     return tuple(height for height in heights if nearest <= height <= farthest)
 
 
@@ -206,12 +216,12 @@ def look_ahead(
     heights_m: Sequence[float],
     conditions: Conditions,
 ) -> tuple[Outlook, ...]:
-    """Return what to expect from each height.
+    """Return the expected detection and accuracy for each height.
 
     Raises
     ------
     SettingError
-        If a height cannot be, or no ring is found in such blur.
+        If a height is impossible, or the blur is too large for any ring.
     """
     for height_m in heights_m:
         require_range("height", height_m, 0.0, 1e5, unit="m", open_low=True)
@@ -312,7 +322,7 @@ def _plain_outlook(
 
 
 def least_plain_px(target: PlainTarget) -> float:
-    """Return the least radius at which all circles of a plain target are told apart [px]."""
+    """Return the least radius at which all circles of a plain target are distinguished [px]."""
     radii = target.radii_m
     least_px = smallest_radius_px(target)
     if len(radii) == 1:
@@ -328,11 +338,12 @@ def least_plain_px(target: PlainTarget) -> float:
 def _plain_accuracy(
     camera: Camera, target: PlainTarget, radius_px: float, conditions: Conditions
 ) -> tuple[float, float]:
-    """Return the deviations of the distance, relative, and of the centre per axis [px].
+    """Return standard deviations: of the distance, relative, and of the centre per axis [px].
 
-    The centre of a disc of radius R is known to σ_c = (σ_n / C) √(2 s / (√π R)) by its edge, spread
-    by s, its radius to σ_c / √2, and a semi-axis to √1.5 σ_c. What is not known of the normal, by
-    its prior and by the axes, displaces the centre by (R² / f) σ.
+    A disc has the radius R and an edge of spread s and contrast C in noise σ_n. Its edge determines
+    the centre to σ_c = (σ_n / C) √(2 s / (√π R)), the radius to σ_c / √2, and a semi-axis to
+    √1.5 σ_c. The normal has the standard deviation σ by its prior and by the axes together, which
+    displaces the centre by (R² / f) σ.
     """
     sensor = Sensor()
     plate = PlainPlate(target)
@@ -343,14 +354,14 @@ def _plain_accuracy(
     shares = [radius_m / target.radii_m[0] for radius_m in target.radii_m]
     centre_px = noise / (bright - dark)
     centre_px *= math.sqrt(2.0 * edge_px / (math.sqrt(math.pi) * radius_px * sum(shares)))
-    # a circle's radius says R_i² as much of the scale as one of unit radius
+    # the information of a circle's radius about the scale is proportional to R_i²
     scale = centre_px / math.sqrt(2.0) / radius_px
     scale *= math.sqrt(sum(shares) / sum(share**3 for share in shares))
     by_axes = math.sqrt(1.5) * centre_px / (radius_px * math.sin(math.radians(TILT_DEG)))
-    normal = 1.0 / math.hypot(1.0 / by_axes, 1.0 / math.radians(target.sd_normal_deg))
-    turned_px = radius_px**2 / camera.mean_focal_px * normal
+    sd_normal = 1.0 / math.hypot(1.0 / by_axes, 1.0 / math.radians(target.sd_normal_deg))
+    by_normal_px = radius_px**2 / camera.mean_focal_px * sd_normal
     by_distance, by_centre = PLAIN_SCATTER
-    return by_distance * scale, by_centre * math.hypot(centre_px, turned_px)
+    return by_distance * scale, by_centre * math.hypot(centre_px, by_normal_px)
 
 
 def _eccentricity_px(camera: Camera, radius_px: float) -> float:
@@ -364,14 +375,14 @@ def _eccentricity_px(camera: Camera, radius_px: float) -> float:
 
 
 def _seen_ring(camera: Camera, target: Target, metre_px: float) -> Ring | None:
-    """Return the largest ring that is wholly in the image."""
+    """Return the largest ring that fits into the image."""
     largest_px = LARGEST_SHARE * min(camera.width, camera.height)
     fitting = (r for r in target.rings if 0.5 * r.outer_diameter_m * metre_px <= largest_px)
     return next(fitting, None)
 
 
 def chance_to_find(radius_px: float) -> tuple[float, float, float]:
-    """Return the probability that a ring is found, and Wilson's interval of 95 %.
+    """Return the probability that a ring is found, and its 95 % interval (Wilson).
 
     E. B. Wilson, JASA 22 (1927), 209–212.
     """
@@ -382,7 +393,7 @@ def chance_to_find(radius_px: float) -> tuple[float, float, float]:
 
 
 def _wilson(found: int, shown: int) -> tuple[float, float, float]:
-    # Loaded here because it takes long, and only plans need it.
+    # imported here because it takes long, and only plans need it
     from scipy.stats import binomtest
 
     interval = binomtest(found, shown).proportion_ci(0.95, method="wilson")
@@ -390,7 +401,7 @@ def _wilson(found: int, shown: int) -> tuple[float, float, float]:
 
 
 def _of_unit_size(ring: Ring) -> Ring:
-    """Return a ring of these proportions, 1 m across."""
+    """Return a ring of the same proportions with a diameter of 1 m."""
     lengths_m = (ring.inner_diameter_m, ring.code_diameter_m, ring.dot_diameter_m)
     inner, code, dot = (round(length_m / ring.outer_diameter_m, 6) for length_m in lengths_m)
     return Ring("", 1.0, inner, code, dot, ring.code_deg)
@@ -398,37 +409,39 @@ def _of_unit_size(ring: Ring) -> Ring:
 
 @lru_cache(maxsize=8)
 def _accuracy(camera: Camera, ring: Ring, conditions: Conditions) -> _Accuracy:
-    """Compute the bound at some radii, for plates tilted in several ways, times the scatter."""
+    """Return bounds times scatter for some radii, averaged over directions of tilt and streak."""
     blur_px = conditions.blur_px
     radii_px = np.array([each for each in _RADII_PX if each >= conditions.least_ring_px])
-    # In the middle of the image there is no distortion; small images must not cut the ring.
+    # The middle of the image has no distortion. The image is large, so that it holds every ring.
     spacious = Camera(1000, 1000, camera.fx, camera.fy, 499.5, 499.5, response=camera.response)
     plate = PrintedPlate(Target(ring), regular_polygon(4, 0.7 * ring.outer_diameter_m))
     by_distance, by_centre = SCATTER[camera.response is Response.LINEAR]
     variances = np.zeros((2, len(radii_px)))
     for column, radius_px in enumerate(radii_px.tolist()):
         distance_m = 0.5 * ring.outer_diameter_m * camera.mean_focal_px / radius_px
-        for way_deg in _WAYS_DEG:
-            way = math.radians(way_deg)
-            optics = Optics(conditions.psf_px, (blur_px * math.cos(way), blur_px * math.sin(way)))
-            pose = _pose(camera, distance_m, way)
+        for direction_deg in _DIRECTIONS_DEG:
+            direction = math.radians(direction_deg)
+            optics = Optics(
+                conditions.psf_px, (blur_px * math.cos(direction), blur_px * math.sin(direction))
+            )
+            pose = _pose(camera, distance_m, direction)
             shot = Shot(spacious, plate, pose, optics, Sensor(), GAIN, blur_px > 0.0, _SUB_PIXELS)
             bound = bound_of(shot)
             variances[:, column] += (0.01 * bound.distance_percent) ** 2, 0.5 * bound.centre_px**2
     from scipy.interpolate import PchipInterpolator  # 0.2 s that `kgcp detect` does not need
 
-    distance, centre = np.sqrt(variances / len(_WAYS_DEG))
+    distance, centre = np.sqrt(variances / len(_DIRECTIONS_DEG))
     return _Accuracy(
         PchipInterpolator(np.log(radii_px), np.log(by_distance * distance * radii_px**1.5)),
         PchipInterpolator(np.log(radii_px), np.log(by_centre * centre * radii_px**0.5)),
     )
 
 
-def _pose(camera: Camera, distance_m: float, way: float = 0.0) -> Pose:
-    """Return a plate in the middle of the image, tilted one way [rad]."""
-    axis = math.radians(TILT_DEG) * np.array([-math.sin(way), math.cos(way), 0.0])
-    off = _OFF_PX / camera.mean_focal_px
-    ray = np.array([off, -off, 1.0])
+def _pose(camera: Camera, distance_m: float, direction: float = 0.0) -> Pose:
+    """Return the pose of a plate in the middle of the image, tilted in a direction [rad]."""
+    axis = math.radians(TILT_DEG) * np.array([-math.sin(direction), math.cos(direction), 0.0])
+    offset = _CENTRE_OFFSET_PX / camera.mean_focal_px
+    ray = np.array([offset, -offset, 1.0])
     return Pose(
         Rotation.from_rotvec(axis).as_matrix(), distance_m * ray / float(np.linalg.norm(ray))
     )

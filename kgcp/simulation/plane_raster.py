@@ -1,4 +1,4 @@
-"""Windows of the image, seen as pieces of a plane: pixel integration by exact coverage."""
+"""Windows of the image back-projected onto a plane: pixel integration by exact coverage."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class PlaneRaster:
         piece += opacity * self._coverage(shape, place) * (value - piece)
 
     def _slices(self, shape: Region) -> tuple[slice, slice] | None:
-        """Return the sub-pixels that may see the shape; None where it is outside the window."""
+        """Return the sub-pixels that may see the shape; None if it is outside the window."""
         corner, size = outline_box(self.camera, self.pose, shape)
         origin = np.array([self.window.column, self.window.row]) - 0.5
         first = np.floor((corner - origin) * self.oversampling).astype(int) - 2
@@ -130,7 +130,7 @@ class PlaneRaster:
         )
 
     def _largest_step(self, place: tuple[slice, slice]) -> float:
-        """Return more than the largest width of a sub-pixel within `place` [m]."""
+        """Return an upper bound of the width of sub-pixels within `place` [m]."""
         corner_rows = np.array([place[0].start, place[0].stop - 1])[[0, 0, 1, 1]]
         corner_columns = np.array([place[1].start, place[1].stop - 1])[[0, 1, 0, 1]]
         across, down = self._steps(corner_rows, corner_columns)

@@ -1,4 +1,4 @@
-"""The printed plate as light: exact coverage on sub-pixels, spread and integrated over pixels."""
+"""Rendering of plates: exact coverage of sub-pixels, blurred and integrated over pixels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ from kgcp.simulation.regions import ConvexPolygon, DiscRegion, Region
 from kgcp.targets.layout import Target
 from kgcp.targets.plain import PlainPolarity, PlainTarget
 
-_SUB_PIXELS_ACROSS = 1000  # of a window: memory and time are bounded, small targets get most
+# Sub-pixels along the longer side of a window. This limits memory and time, and gives small targets
+# the most sub-pixels per pixel.
+_SUB_PIXELS_ACROSS = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +43,7 @@ class PrintedPlate:
 
 @dataclass(frozen=True, slots=True)
 class PlainPlate:
-    """A plain target with its border, both of one radiance each."""
+    """A plain target with its border, each of uniform radiance."""
 
     target: PlainTarget  # without a `border_m`, it lies on the ground as it is
     # radiances under the frame's light, 0…1
@@ -55,7 +57,7 @@ class PlainPlate:
 
     @property
     def outline(self) -> DiscRegion:
-        """What hides the ground."""
+        """The area that hides the ground."""
         return DiscRegion((0.0, 0.0), self.target.radii_m[0] + self.border_m)
 
     @property
@@ -104,7 +106,7 @@ class PlateImage:
 
 
 def plate_window(camera: Camera, plate: Plate, pose: Pose, optics: Optics) -> PixelWindow:
-    """Return the window that holds everything the plate sends light to."""
+    """Return the window with all pixels that light from the plate reaches."""
     corner, size = outline_box(camera, pose, plate.outline)
     margin = optics.reach_px
     column, row = np.floor(corner).astype(int) - margin
@@ -129,9 +131,9 @@ def image_plate(
     pose : Pose
         Target → camera.
     window : PixelWindow, optional
-        Where to look; default: everything that the plate sends light to.
+        Pixels to render; default: all that light from the plate reaches.
     field : PlateLight, optional
-        Default: the same light everywhere.
+        Light on the plate; default: uniform.
     """
     if window is None:
         window = plate_window(camera, plate, pose, optics)

@@ -1,13 +1,13 @@
-"""Point spreads of real lenses: astigmatic, comatic, out of focus, their centroid where it belongs.
+"""Point spreads of real lenses: astigmatism, coma and defocus.
 
-Coma is Seidel's: rays through the ring of relative radius ρ of the aperture meet the image on a
-circle of radius A ρ², 2 A ρ² away from the chief ray. Uniform light in the aperture puts the
-centroid at A, variances A²/2 along and A²/6 across the tail, and third central moments A³/4 along
-and A³/12 mixed. The spread is moved by −A, so that its centroid is the pixel that a calibration
-means, and the Gaussian that comes on top is made narrower by the coma's variances: second moments
-do not depend on the coma.
+Coma is Seidel's. Rays through the ring of relative radius ρ in the aperture meet the image on a
+circle of radius A ρ², whose centre is 2 A ρ² from the chief ray. With uniform light in the
+aperture, the centroid is at A, the variances are A²/2 along and A²/6 across the tail, and the third
+central moments A³/4 along it and A³/12 mixed. The spread is shifted by −A, because calibrations
+refer to the centroid. It is convolved with a Gaussian that is narrower by the coma's variances, so
+that second moments do not depend on the coma.
 
-Out of focus, the aperture's image is a uniform disc, on top of all that.
+Defocus adds the image of the aperture, a uniform disc.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from kgcp.errors import SettingError
 from kgcp.geometry.arrays import ComplexArray, FloatArray
 from kgcp.settings import require_range
 
-_NEGLIGIBLE = 1e-7  # of the transfer
-_MOST_COMA = 0.5  # of psf³, with equal axes: a fifth of the variance is left to the Gaussian
+_NEGLIGIBLE = 1e-7  # value of the transfer function
+_MAX_COMA = 0.5  # over psf³, for equal axes; it leaves a fifth of the variance to the Gaussian
 _EXTRA_NODES = 5
 
 
@@ -39,9 +39,9 @@ class Aberration:
 
     def __post_init__(self) -> None:
         require_range("astigmatism", self.astigmatism, 1.0, 5.0)
-        require_range("coma", self.coma, 0.0, _MOST_COMA)
+        require_range("coma", self.coma, 0.0, _MAX_COMA)
         require_range("defocus", self.defocus_px, 0.0, 10.0, unit="px")
-        most = _MOST_COMA / self.astigmatism**1.5
+        most = _MAX_COMA / self.astigmatism**1.5
         if self.coma > most:
             raise SettingError(
                 "coma",

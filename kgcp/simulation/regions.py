@@ -1,4 +1,4 @@
-"""Exact planar shapes, known by their signed distance: what the simulator paints with."""
+"""Exact planar shapes for painting, each given by its signed distance."""
 
 from __future__ import annotations
 
@@ -128,8 +128,9 @@ class AnnularSector:
         """Return points (n, 2) whose convex hull holds the shape [m]."""
         angles = np.linspace(self.start_rad, self.end_rad, _POINTS_PER_EDGE)
         arc: FloatArray = np.column_stack((np.cos(angles), np.sin(angles)))
-        over = 1.0 / math.cos(0.5 * (angles[1] - angles[0]))  # chords cut off what is beyond them
-        return np.concatenate((self.inner_m * arc, over * self.outer_m * arc))
+        # chords cut off parts of the outer arc: enlarge it so that they touch the arc
+        enlargement = 1.0 / math.cos(0.5 * (angles[1] - angles[0]))
+        return np.concatenate((self.inner_m * arc, enlargement * self.outer_m * arc))
 
     def signed_distance(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the largest distance to an edge [m]: exact but for the corners' outside."""

@@ -1,8 +1,8 @@
 """A rolling shutter: rows are exposed one after the other while the image moves.
 
-A row shows the image of its own moment, moved as a whole; within a row nothing is sheared. So the
-blurred image is evaluated at pixels that are moved row by row, which is exact for an image whose
-sub-pixels resolve its blur: no pixels are interpolated.
+A row shows the image at its own moment, shifted as a whole and not sheared. So the blurred image is
+evaluated, in the frequency domain, at pixels that are shifted row by row. This is exact if the
+sub-pixels resolve the blur; nothing is interpolated.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class ImageMotion:
         require_range("sd_px_s", self.sd_px_s, 0.0, 1e5, unit="px/s")
 
     def drawn(self, camera: Camera, still_row: float, rng: np.random.Generator) -> RowMotion:
-        """Draw the motion of one frame about a row that is where the pose says."""
+        """Draw the motion of one frame about `still_row`, to whose moment the pose refers."""
         motion_px_s = self.mean_px_s + self.sd_px_s * rng.standard_normal(2)
         x, y = motion_px_s * camera.readout_s / (camera.height - 1)
         return RowMotion((float(x), float(y)), still_row, camera.height)
