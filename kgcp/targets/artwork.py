@@ -12,21 +12,24 @@ from kgcp.targets.rulers import across, down, ruler_mm
 from kgcp.targets.shapes import Artwork, Box, Circle, Layer, Point, Polyline, Primitive, Text
 
 MARGIN = 0.125
-"""White around the ring, of its diameter: the search looks at 0.08, blur and tilt take some."""
-_CROP_START, _CROP_END = 3.0, 10.0  # of marks beyond the plate, in units of the legend
-_HOLE_INSET = 1.5  # from the plate's edge to a hole's centre, of the hole's diameter …
-_HOLE_RIM_MM = 6.0  # … or from its rim, if that is more
-_HOLE_CROSS = 0.7  # from a hole's centre to the ends of its cross, of its diameter
-_LEAST_ROOM = 4.0  # above the ring, for an arrow on the plate, in units of the legend
-_NARROWEST_MM = 130.0  # of the legend
-_LEGEND_FROM, _LEGEND_TO = 190.0, 800.0  # widths between which the legend grows [mm]
+"""Width of the white margin around the ring, relative to its diameter. The search samples it at
+0.08; the rest allows for blur and tilt."""
+_CROP_START, _CROP_END = 3.0, 10.0  # distances of crop marks from the plate, in legend units
+# Distance of a hole from the plate's edge: of its centre, relative to the hole's diameter, or of
+# its rim, whichever puts it farther inside.
+_HOLE_INSET = 1.5
+_HOLE_RIM_MM = 6.0
+_HOLE_CROSS = 0.7  # half the size of a hole's cross, relative to its diameter
+_MIN_ARROW_ROOM = 4.0  # above the ring, for an arrow on the plate, in legend units
+_MIN_LEGEND_MM = 130.0  # width
+_LEGEND_FROM_MM, _LEGEND_TO_MM = 190.0, 800.0  # widths between which the legend grows
 
 
 @dataclass(frozen=True, slots=True)
 class MountingPlate:
     """The plate that the target is mounted on."""
 
-    width_mm: float  # of the square, or diameter
+    width_mm: float  # side of the square, or diameter
     is_round: bool = False
     hole_mm: float | None = None  # diameter of four mounting holes; None: no holes
 
@@ -75,7 +78,7 @@ def draw_target(target: Target, plate: MountingPlate | None) -> Artwork:
         shapes += _plate_name(target, plate, radius_mm)
     for ring in target.rings:
         shapes += _draw_ring(ring)
-    widen = max(0.0, 0.5 * (_NARROWEST_MM - box.width))
+    widen = max(0.0, 0.5 * (_MIN_LEGEND_MM - box.width))
     box = Box(box.left - widen, box.top, box.right + widen, box.bottom)
     legend, bottom = _legend(target, box, radius_mm, is_beside=plate is None)
     up = _up_mark(box, radius_mm) if plate is None else _up_mark_on(plate, radius_mm)
@@ -129,7 +132,7 @@ def _draw_plate(plate: MountingPlate) -> Iterator[Primitive]:
 
 
 def _plate_name(target: Target, plate: MountingPlate, radius_mm: float) -> Iterator[Text]:
-    """Yield what stays on a square plate once it is cut, where there is room for it."""
+    """Yield the label that stays on a square plate once it is cut, if there is room for it."""
     unit, half = _unit(plate.width_mm), 0.5 * plate.width_mm
     aside = 2.0 * plate.inset_mm if plate.hole_mm else 4.0 * unit
     size, baseline = 3.5 * unit, half - 4.0 * unit
@@ -166,14 +169,14 @@ def _up_mark(box: Box, radius_mm: float) -> Polyline:
 
 
 def _up_mark_on(plate: MountingPlate, radius_mm: float) -> Polyline:
-    """Return an arrow on the plate, outside the white that the ring needs.
+    """Return an arrow on the plate, outside the ring's white margin.
 
-    It is above the ring or, on a square plate with too little room there, beside the hole in the
-    top left corner. On a round plate without room it is outside: it is cut off.
+    It is above the ring or, if a square plate has too little room there, beside the hole in the top
+    left corner. If a round plate has too little room, the arrow is outside, and will be cut off.
     """
     unit, half = _unit(plate.width_mm), 0.5 * plate.width_mm
     room = half - radius_mm
-    if room > _LEAST_ROOM * unit:
+    if room > _MIN_ARROW_ROOM * unit:
         height = min(6.0 * unit, 0.6 * room)
         return _arrow(0.0, 0.5 * (room - height) - half, height)
     if plate.is_round:
@@ -192,7 +195,7 @@ def _arrow(x: float, top: float, height: float) -> Polyline:
 def _legend(
     target: Target, box: Box, radius_mm: float, *, is_beside: bool
 ) -> tuple[list[Primitive], float]:
-    """Return rulers and words below the target, and where they end."""
+    """Return rulers and text below the target, and their lower end [mm]."""
     unit = _unit(box.width)
     lines = _words(target)
     top = box.bottom + 3.0 * unit
@@ -217,8 +220,8 @@ def _legend(
 
 
 def _unit(width_mm: float) -> float:
-    """Return how large type and marks are: those of a sheet of A4 are 1."""
-    return min(max(width_mm, _LEGEND_FROM), _LEGEND_TO) / _LEGEND_FROM
+    """Return the legend unit, the size of type and marks; it is 1 on a sheet of A4."""
+    return min(max(width_mm, _LEGEND_FROM_MM), _LEGEND_TO_MM) / _LEGEND_FROM_MM
 
 
 def _words(target: Target) -> list[str]:

@@ -1,4 +1,4 @@
-"""Codes of targets: how far apart they are, which are the farthest, and which to print."""
+"""Codes of targets: their distances, and the choice of new codes with large distances."""
 
 from __future__ import annotations
 
@@ -21,30 +21,31 @@ from kgcp.targets.validation import check_targets, rotations_coincide, same_shap
 _Kind = TypeVar("_Kind", bound=AnyTarget)
 
 LEAST_DISTANCE = 2.0
-"""Dots by which new codes must differ: less than one dot elsewhere is dirt or a shadow."""
+"""Least distance of new codes, in dots. One dot in another place counts two; dirt or a shadow may
+change less than that."""
 DOTS = (3, 6)  # fewer dots distinguish too few codes; more dots overlap in any arrangement
 _GRID_DEG, _STARTS = 5.0, 6
-# Many codes that do not fit on that grid may fit on a coarser one. Codes are told apart by a dot
-# that is off by more than a dot's width: two steps of a grid just coarser than half of it. On the
-# fine grid the search leaves gaps between codes that no other fits into: it places 43 codes of
-# four dots. The coarse one places 50, from a quarter of its starts.
+# A coarser grid may hold more codes. Two codes differ if a dot is displaced by more than a dot's
+# width, which is two steps of a grid just coarser than half of that width. On the fine grid, the
+# search leaves gaps between codes into which no other fits: it finds 43 codes of four dots. On the
+# coarse grid, it finds 50, from a quarter of its starts.
 _COARSE_GRIDS_DEG, _COARSE_STARTS = (6.0, 8.0, 9.0, 10.0, 12.0, 15.0, 18.0, 20.0, 24.0), 40
-_STRIDE = 8  # from start to start, down the list of the best codes
-_ROOM = 1.5  # from dot to dot, of a dot's width: ink must be seen between them
-_MOST = 10_000  # candidates: those that are farthest from themselves
-_BETTER = 1e-4  # of a dot
+_STRIDE = 8  # between starts in the list of candidates, best ones first
+_MIN_SPACING = 1.5  # between dots, relative to a dot's width: ink must be visible between them
+_MAX_CANDIDATES = 10_000  # those with the largest distance to themselves
+_MIN_GAIN = 1e-4  # of an exchange, in dots
 
-# The proportions of Cucci's target: inner and code circle and dots, of the outer diameter.
+# Proportions of Cucci's target, relative to the outer diameter: inner circle, code circle, dots.
 _INNER, _CODE, _DOT = 1.0 / 2.0, 1.0 / 1.4, 1.0 / 7.0
 
 
 def dots_apart(first: Ring, second: Ring, *, mirrored: bool = False) -> float:
-    """Return the distance of two codes over all rotations, in dots.
+    """Return the least distance of two codes over all rotations, in dots.
 
     Parameters
     ----------
     first, second : Ring
-        Of one shape.
+        Rings of the same shape.
     mirrored : bool
         Whether the second one is seen from behind.
     """
@@ -55,14 +56,14 @@ def dots_apart(first: Ring, second: Ring, *, mirrored: bool = False) -> float:
 
 
 def dots_apart_turned(ring: Ring) -> float:
-    """Return the distance of a code to itself, turned by a dot's width or more."""
+    """Return the least distance of a code to itself rotated by a dot's width or more, in dots."""
     code = np.array(ring.code_deg)
     overlap = _turned_overlap(code[None], 2.0 * ring.dot_half_angle_deg)[0]
     return 2.0 * (len(code) - float(overlap))
 
 
 def least_apart(rings: Sequence[Ring]) -> float:
-    """Return the least distance of any code to itself, turned, and to others of its shape."""
+    """Return the least distance of any code to itself rotated, and to others of its shape."""
     distances = [dots_apart_turned(ring) for ring in rings]
     for first, second in itertools.combinations(rings, 2):
         if same_shape(first, second):
@@ -76,8 +77,8 @@ def check_new_codes(new: Sequence[Target], known: Sequence[Target]) -> None:
     Raises
     ------
     SettingError
-        If the targets cannot be told apart, as in flight.toml, or if a new code is nearer than
-        `LEAST_DISTANCE` dots to itself turned or to another code, turned or mirrored.
+        If `check_targets` refuses them, or if a new code is closer than `LEAST_DISTANCE` dots to
+        itself rotated or to another code, rotated or mirrored.
     """
     check_targets((*known, *new))
     for target in new:
@@ -107,25 +108,26 @@ def _confusable(ring: Ring, other: str, apart: float) -> SettingError:
 def propose_codes(
     ring: Ring, count: int, dots: int, known: Sequence[Ring] = ()
 ) -> tuple[tuple[float, ...], ...]:
-    """Return codes whose least distance, to themselves, each other and known ones, is large.
+    """Return codes with a large least distance to themselves, each other and known ones.
 
-    All codes on a grid with ink between the dots are candidates. From the best ones, the candidate
-    that is farthest from all chosen is added; then each is exchanged for a better one as long as
-    there is one. The result is the best of several such searches; it need not be the best of all.
+    Candidates are all codes on a grid with ink between the dots. Each search starts with one of the
+    best candidates, and adds the candidate that is farthest from all chosen ones. Then chosen codes
+    are exchanged for better ones as long as possible. The best of several searches is returned; it
+    need not be the optimum.
 
     Parameters
     ----------
     ring : Ring
-        Its proportions; its code does not matter.
+        Ring with the wanted proportions; its code is ignored.
     count, dots : int
-        How many codes, of how many dots.
+        Number of codes, and of dots in each.
     known : sequence of Ring
-        Rings of this shape that are in use already.
+        Rings of this shape that are already in use.
 
     Raises
     ------
     SettingError
-        If so many codes would be confused with each other.
+        If so many codes could be confused with each other.
     """
     require_range("dots", dots, *DOTS)
     if not len(_candidates(dots, 2.0 * ring.dot_half_angle_deg, _GRID_DEG)):
@@ -152,10 +154,10 @@ def propose_codes(
 def _farthest_codes(
     ring: Ring, count: int, dots: int, known: Sequence[Ring], grid_deg: float, starts: int
 ) -> tuple[tuple[tuple[float, ...], ...], float]:
-    """Return codes of one grid that are far apart, and their least distance; 0 without codes.
+    """Return codes on one grid that are far apart, and their least distance; 0 without codes.
 
-    Codes that `check_targets` would take for one another count as no distance apart: all their
-    dots may be off by half a dot, which adds up to more than `LEAST_DISTANCE`.
+    The distance of codes that `check_targets` does not distinguish counts as zero. Each of their
+    dots may differ by half a dot, which can add up to more than `LEAST_DISTANCE`.
     """
     width_deg = 2.0 * ring.dot_half_angle_deg
     candidates = _candidates(dots, width_deg, grid_deg)
@@ -165,7 +167,7 @@ def _farthest_codes(
         half_deg = min(ring.dot_half_angle_deg, other.dot_half_angle_deg)
         own = np.minimum(own, _apart(candidates, code, width_deg))
         own[rotations_coincide(candidates, code, half_deg)] = 0.0
-    best = np.argsort(-own, kind="stable")[:_MOST]
+    best = np.argsort(-own, kind="stable")[:_MAX_CANDIDATES]
     field = _Candidates(candidates[best], own[best], width_deg, grid_deg, {})
     first = range(0, min(len(best), starts * _STRIDE), _STRIDE)
     results = [_search(field, start, count) for start in first]
@@ -178,8 +180,8 @@ def _farthest_codes(
 def _candidates(dots: int, width_deg: float, grid_deg: float) -> FloatArray:
     """Return the codes (m, dots) on a grid, once per rotation, the first dot at 0 [deg]."""
     steps = round(360.0 / grid_deg)
-    least = math.ceil(_ROOM * width_deg / grid_deg)
-    free = steps - dots * least  # to be shared out among the gaps
+    least = math.ceil(_MIN_SPACING * width_deg / grid_deg)
+    free = steps - dots * least  # to be distributed among the gaps
     if free < 0:
         return np.empty((0, dots))
     bars = np.array(list(itertools.combinations(range(free + dots - 1), dots - 1)))
@@ -197,10 +199,11 @@ def _as_number(gaps: np.ndarray[tuple[int, ...], np.dtype[np.int_]]) -> FloatArr
 
 
 def _overlap(codes: FloatArray, other: FloatArray, width_deg: float) -> FloatArray:
-    """Return how many dots of codes (m, n) lie on dots of another, for rotations (m, k).
+    """Return the overlap of codes (m, n) with another one in dots, for rotations (m, k).
 
-    The rotations are those that lay some dot exactly onto another: the overlap of discs seen as
-    arcs is a sum of triangles over the rotation, whose maxima are at their tops.
+    The rotations are those that put some dot exactly onto another. The largest overlap is among
+    them: with dots as arcs, overlap as a function of rotation is a sum of triangles, and has its
+    maxima at their peaks.
     """
     between = other[None, None, :] - codes[:, :, None]
     turns = between.reshape(len(codes), 1, 1, -1)
@@ -208,13 +211,13 @@ def _overlap(codes: FloatArray, other: FloatArray, width_deg: float) -> FloatArr
 
 
 def _share(off_deg: FloatArray, width_deg: float) -> FloatArray:
-    """Return how much of a dot lies on another that is off by an angle along the circle."""
+    """Return the overlap 0…1 of two dots with an angular offset along the code circle."""
     off_deg = np.abs((off_deg + 180.0) % 360.0 - 180.0)
     return np.asarray(np.maximum(1.0 - off_deg / width_deg, 0.0))
 
 
 def _turned_overlap(codes: FloatArray, width_deg: float) -> FloatArray:
-    """Return the largest overlap (m,) of each code with itself, turned by a dot's width or more."""
+    """Return the largest overlap (m,) of codes with themselves rotated by a dot's width or more."""
     first, second = np.nonzero(~np.eye(codes.shape[1], dtype=bool))
     turns = codes[:, second] - codes[:, first]
     overlap = np.zeros(turns.shape)
@@ -225,7 +228,7 @@ def _turned_overlap(codes: FloatArray, width_deg: float) -> FloatArray:
 
 
 def _apart(codes: FloatArray, other: FloatArray, width_deg: float) -> FloatArray:
-    """Return the distances (m,) of codes to another, over all rotations and mirror images."""
+    """Return the least distances (m,) of codes to another over all rotations and mirror images."""
     overlap = np.maximum(
         _overlap(codes, other, width_deg).max(axis=1),
         _overlap(codes, -other, width_deg).max(axis=1),
@@ -235,20 +238,18 @@ def _apart(codes: FloatArray, other: FloatArray, width_deg: float) -> FloatArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidates:
-    """Codes on the grid, and their distances as far as they were needed."""
+    """Codes on a grid, with distances computed on demand."""
 
     codes: FloatArray  # (m, n): [deg]
-    own: FloatArray  # (m,): distances to themselves, turned, and to known codes
-    # of a dot, and from one place of a dot to the next
-    width_deg: float
-    grid_deg: float
+    own: FloatArray  # (m,): least distances to themselves, rotated, and to known codes
+    width_deg: float  # of a dot
+    grid_deg: float  # step of the grid
     rows: dict[int, FloatArray]  # index of a candidate → distances (m,) of all to it
 
     def apart(self, index: int) -> FloatArray:
-        """Return the distances (m,) of all candidates to one of them; as `_apart`, but quicker.
+        """Return the distances (m,) of all candidates to one of them, as `_apart`, but faster.
 
-        On the grid all rotations are tried by looking up how much of a dot at some place lies on
-        the other's dots.
+        On the grid, the overlap of a dot with the other code is a table over places and rotations.
         """
         if index not in self.rows:
             places_deg = self.grid_deg * np.arange(round(360.0 / self.grid_deg))
@@ -267,13 +268,13 @@ class _Candidates:
 
 
 def _search(field: _Candidates, start: int, count: int) -> tuple[list[int], float]:
-    """Choose `count` candidates far apart, and return them with their least distance."""
+    """Choose `count` candidates that are far apart; return them and their least distance."""
     chosen = [start]
     least = np.minimum(field.own, field.apart(start))
     while len(chosen) < count:
         chosen.append(int(least.argmax()))
         least = np.minimum(least, field.apart(chosen[-1]))
-    # Distances of all candidates to the chosen ones, and to one infinitely far away.
+    # distances of all candidates to the chosen ones, and a last row of infinities
     rows = np.array([*map(field.apart, chosen), np.full(len(least), np.inf)])
     is_better = True
     while is_better:
@@ -282,7 +283,7 @@ def _search(field: _Candidates, start: int, count: int) -> tuple[list[int], floa
         for place, held in enumerate(chosen):
             without = np.minimum(field.own, np.where(rows[place] == nearest, second, nearest))
             best = int(without.argmax())
-            if without[best] > without[held] + _BETTER:
+            if without[best] > without[held] + _MIN_GAIN:
                 chosen[place], rows[place], is_better = best, field.apart(best), True
                 nearest, second = np.partition(rows, 1, axis=0)[:2]
     between = rows[:-1, chosen]
@@ -291,7 +292,7 @@ def _search(field: _Candidates, start: int, count: int) -> tuple[list[int], floa
 
 
 def chosen_targets(known: Sequence[_Kind], names: Sequence[str]) -> tuple[_Kind, ...]:
-    """Return the targets of these names, or all.
+    """Return the targets with these names, or all if there are no names.
 
     Raises
     ------
@@ -318,13 +319,13 @@ def new_targets(
     Parameters
     ----------
     known : sequence of Target
-        From which they must differ; they have the proportions of the first of them.
+        Targets from which the new ones must differ; the first one gives the proportions.
     diameter_m : float or None
         Outer diameter; None: that of the first known target.
     codes : sequence of str
         Directions of dots [deg], separated by commas.
     count, dots : int
-        How many codes to propose, of how many dots.
+        Number of codes to propose, and of dots in each.
 
     Raises
     ------
@@ -347,7 +348,7 @@ def new_targets(
 
 
 def _model(known: Sequence[Target], diameter_m: float | None) -> Ring:
-    """Return a ring of the size and proportions that are wanted."""
+    """Return a ring with the wanted size and proportions."""
     if known:
         first = known[0].ring
         scale = 1.0 if diameter_m is None else diameter_m / first.outer_diameter_m
@@ -368,7 +369,7 @@ def _model(known: Sequence[Target], diameter_m: float | None) -> Ring:
 
 
 def _rounded(length_m: float) -> float:
-    """Return a length to the micrometre: what is printed is what flight.toml says."""
+    """Return a length rounded to micrometres, so that print and flight.toml agree exactly."""
     return round(length_m, 6)
 
 

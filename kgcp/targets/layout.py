@@ -14,7 +14,7 @@ from kgcp.errors import SettingError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.settings import require_range
 
-_MOST_DOTS = 100  # a code is compared degree by degree
+_MAX_DOTS = 100  # codes are compared in steps of a degree
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,13 +26,13 @@ class Ring:
     name : str
         As in flight.toml.
     outer_diameter_m, inner_diameter_m : float
-        Edges of the black ring [m].
+        Diameters of the black ring's edges [m].
     code_diameter_m, dot_diameter_m : float
-        Circle of the dots' centres, and the dots themselves [m].
+        Diameters of the circle through the dots' centres, and of the dots [m].
     code_deg : tuple of float
         Directions of the dots' centres, in [0, 360), sorted [deg].
     sd_outer_diameter_m : float
-        How well the print is known [m].
+        Standard deviation of the printed outer diameter [m].
     """
 
     name: str
@@ -69,9 +69,9 @@ class Ring:
             )
         if len(self.code_deg) == 0:  # it may be an array
             raise SettingError("code_deg", "is empty", "give the direction of at least one dot")
-        if len(self.code_deg) > _MOST_DOTS:
+        if len(self.code_deg) > _MAX_DOTS:
             problem = f"has {len(self.code_deg)} dots"
-            raise SettingError("code_deg", problem, f"give at most {_MOST_DOTS}")
+            raise SettingError("code_deg", problem, f"give at most {_MAX_DOTS}")
         for angle in self.code_deg:
             require_range("code_deg", angle, -360.0, 360.0, unit="deg")
         angles = np.sort(np.mod(self.code_deg, 360.0))
@@ -93,7 +93,7 @@ class Ring:
 
     @property
     def dot_half_angle_deg(self) -> float:
-        """Half the angle that a dot takes on the code circle, seen from the ring's centre [deg]."""
+        """Half the angle that a dot subtends at the ring's centre [deg]."""
         return math.degrees(math.asin(self.dot_diameter_m / self.code_diameter_m))
 
     def dot_centres_m(self) -> FloatArray:
@@ -103,7 +103,7 @@ class Ring:
         return radius * np.column_stack((np.cos(angles), np.sin(angles)))
 
     def scaled(self, name: str, scale: float, code_deg: tuple[float, ...]) -> Ring:
-        """Return a concentric replica with all lengths times `scale` and a code of its own."""
+        """Return a concentric replica: all lengths times `scale`, with its own code."""
         require_range("scale", scale, 0.0, self.inner_ratio, open_low=True)
         return Ring(
             name=name,
@@ -118,12 +118,12 @@ class Ring:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A plate: its main ring, concentric replicas inside, and its position if it stands still.
+    """A plate with its main ring, concentric replicas inside, and its position if it is static.
 
     Attributes
     ----------
     ring : Ring
-        The large ring; its name is the target's name.
+        The main ring; its name is the target's name.
     replicas : tuple of Ring
         Smaller concentric rings, largest first.
     position_m : tuple of float or None
@@ -144,7 +144,7 @@ class Target:
 
     @property
     def diameters_m(self) -> tuple[float, float]:
-        """Of the edges of its main ring [m]."""
+        """Diameters of the main ring's edges [m]."""
         return self.ring.outer_diameter_m, self.ring.inner_diameter_m
 
     @property
@@ -154,7 +154,7 @@ class Target:
 
     @property
     def sd_outer_diameter_m(self) -> float:
-        """How well it is known [m]."""
+        """Standard deviation of the outer diameter [m]."""
         return self.ring.sd_outer_diameter_m
 
     @property

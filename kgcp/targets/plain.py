@@ -1,7 +1,7 @@
 """Targets without a code: plain discs, and rings of concentric circles.
 
-They look like many other things. Only their place tells them from these: a plain target stands
-still at a known position, and is measured only where a frame must show it.
+Many other things look like them, so that they are identified by their place: a plain target is
+static, its position is known, and it is measured only where a frame must show it.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from kgcp.errors import SettingError
 from kgcp.settings import require_range
 from kgcp.targets.layout import Target
 
-_MOST_CIRCLES = 8
-_NARROWEST = 0.95  # an inner circle's diameter over the next outer one's
-_SQUARE = 1e-6  # length of a normal that points nowhere
+_MAX_CIRCLES = 8
+_MAX_RATIO = 0.95  # of an inner circle to the next outer one
+_MIN_NORMAL_LENGTH = 1e-6  # a shorter normal has no direction
 
 
 class Shape(StrEnum):
-    """What is on a target."""
+    """Shape of a target."""
 
-    CODED = "coded"  # ring with dots, by which it is told from others
+    CODED = "coded"  # ring with dots, which identify it
     DISC = "disc"
     RING = "ring"  # concentric circles without dots
 
@@ -38,36 +38,36 @@ class PlainPolarity(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PlainTarget:
-    """A disc, or concentric circles whose areas are dark and bright by turns.
+    """A disc, or concentric circles with alternating dark and bright areas.
 
     Attributes
     ----------
     name : str
         As in flight.toml.
     diameters_m : tuple of float
-        Of its circles, the outermost first [m]: one of a disc, more of a ring.
+        Diameters of its circles, the outermost first [m]: one for a disc, more for a ring.
     polarity : PlainPolarity
-        Of the area directly within the outer circle, against the ground.
+        Of the area directly within the outer circle, relative to the ground.
     position_m, sd_position_m : tuple of float
         Position in the flight's CRS, and its standard deviations [m]; zeros: unknown.
     sd_diameter_m : float
-        How well the outer diameter is known [m]; the others are wrong by the same factor.
+        Standard deviation of the outer diameter [m]; the others are wrong by the same factor.
     normal_enu : (3,) tuple of float, or None
-        Unit normal, out of its front, in local axes east, north, up; None: not known at all.
+        Unit normal, out of its front, in local axes east, north, up; None: unknown.
     sd_normal_deg : float
-        Standard deviation of the normal about either axis square to it [deg].
+        Standard deviation of the normal about each axis perpendicular to it [deg].
     border_m : float or None
-        Width of the even ground around it [m]; None: as even as it happens to be.
+        Width of uniform ground around it [m]; None: nothing is known of the ground.
     thickness_m : float
-        How far its face is from `position_m`, along the normal [m].
+        Distance of its face from `position_m` along the normal [m].
 
     Raises
     ------
     SettingError
-        On making one, for what cannot be a target.
+        On construction, if the target is impossible.
     """
 
-    SD_NORMAL_DEG: ClassVar[float] = 3.0  # of what somebody has laid on the ground
+    SD_NORMAL_DEG: ClassVar[float] = 3.0  # for a target laid on the ground by hand
 
     name: str
     diameters_m: tuple[float, ...]
@@ -81,19 +81,19 @@ class PlainTarget:
     thickness_m: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 1 <= len(self.diameters_m) <= _MOST_CIRCLES:
+        if not 1 <= len(self.diameters_m) <= _MAX_CIRCLES:
             raise SettingError(
                 "inner_diameter_m",
                 f"makes {len(self.diameters_m)} circles",
-                f"give at most {_MOST_CIRCLES}",
+                f"give at most {_MAX_CIRCLES}",
             )
         for diameter in self.diameters_m:
             require_range("diameter_m", diameter, 0.0, 100.0, unit="m", open_low=True)
         for outer, inner in pairwise(self.diameters_m):
-            if inner > _NARROWEST * outer:
+            if inner > _MAX_RATIO * outer:
                 raise SettingError(
                     "inner_diameter_m",
-                    f"{inner:g} m is not below {_NARROWEST:.0%} of the next circle's {outer:g} m",
+                    f"{inner:g} m is not below {_MAX_RATIO:.0%} of the next circle's {outer:g} m",
                     "give diameters from the outside to the inside",
                 )
         require_range("sd_diameter_m", self.sd_diameter_m, 0.0, 1.0, unit="m")
@@ -107,7 +107,7 @@ class PlainTarget:
                 raise SettingError("thickness_m", problem, remedy)
             return
         length = math.hypot(*self.normal_enu)
-        if length < _SQUARE:
+        if length < _MIN_NORMAL_LENGTH:
             remedy = 'give [east, north, up], "level" or "free"'
             raise SettingError("normal", "has no direction", remedy)
         x, y, z = (component / length for component in self.normal_enu)
@@ -125,19 +125,19 @@ class PlainTarget:
 
     @property
     def sd_outer_diameter_m(self) -> float:
-        """How well it is known [m]."""
+        """Standard deviation of the outer diameter [m]."""
         return self.sd_diameter_m
 
     @property
     def radii_m(self) -> tuple[float, ...]:
-        """Of its circles, the outermost first [m]."""
+        """Radii of its circles, the outermost first [m]."""
         return tuple(0.5 * diameter for diameter in self.diameters_m)
 
 
 AnyTarget = Target | PlainTarget
-"""With a code or without."""
+"""A target with or without a code."""
 
 
 def shape_of(target: AnyTarget) -> Shape:
-    """Return what is on a target."""
+    """Return the shape of a target."""
     return target.shape if isinstance(target, PlainTarget) else Shape.CODED

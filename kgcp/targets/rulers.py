@@ -1,4 +1,4 @@
-"""Rulers to check the scale of a print: bars of ten pieces, black and white in turn."""
+"""Rulers to check the scale of a print: bars of ten pieces, alternately black and white."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def ruler_mm(fits: Callable[[float], bool]) -> float:
 def across(
     corner: Point, length_mm: float, unit: float, *, is_marked: bool = True
 ) -> list[Primitive]:
-    """Return a ruler to the right of a point, which is its lower left corner."""
+    """Return a horizontal ruler with its lower left corner at a point."""
     (x, y), step, thick = corner, length_mm / _PIECES, THICK_MM * unit
     outline = Box(x, y - thick, x + length_mm, y)
     shapes: list[Primitive] = [
@@ -43,7 +43,7 @@ def across(
 def down(
     corner: Point, length_mm: float, unit: float, *, is_marked: bool = True
 ) -> list[Primitive]:
-    """Return a ruler above a point, which is its lower left corner."""
+    """Return a vertical ruler with its lower left corner at a point."""
     (x, y), step, thick = corner, length_mm / _PIECES, THICK_MM * unit
     outline = Box(x, y - length_mm, x + thick, y)
     shapes: list[Primitive] = [

@@ -10,8 +10,8 @@ from itertools import pairwise
 
 Point = tuple[float, float]
 LINE_MM = 0.2
-"""Width of lines, which only help to cut, drill and measure."""
-_WIDEST_LETTER = 0.75  # on average, of the type's size
+"""Width of lines for cutting, drilling and measuring."""
+_MAX_LETTER_WIDTH = 0.75  # average over a line of text, relative to the type's size
 
 
 class Layer(StrEnum):
@@ -35,7 +35,7 @@ class Layer(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Circle:
-    """A circle: its line, or its area if it is filled."""
+    """A circle: its outline, or its area if it is filled."""
 
     layer: Layer
     centre_mm: Point
@@ -45,7 +45,7 @@ class Circle:
 
 @dataclass(frozen=True, slots=True)
 class Polyline:
-    """A line through points, or the area that it surrounds if it is filled."""
+    """A line through points, or the enclosed area if it is filled."""
 
     layer: Layer
     points_mm: tuple[Point, ...]
@@ -54,12 +54,12 @@ class Polyline:
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """A line of text, made smaller where it would be wider than its room."""
+    """A line of text; its type is made smaller if it would be wider than its room."""
 
     words: str
     start_mm: Point  # left end of the baseline
-    size_mm: float  # of the type: from line to line, set solid
-    room_mm: float  # how wide it may be
+    size_mm: float  # of the type: distance of lines set solid
+    room_mm: float  # largest width
     is_bold: bool = False
 
 
@@ -100,7 +100,7 @@ class Box:
         return Box(self.left - margin, self.top - margin, self.right + margin, self.bottom + margin)
 
     def moved(self, x: float, y: float) -> Box:
-        """Return the box elsewhere."""
+        """Return the box shifted by x and y."""
         return Box(self.left + x, self.top + y, self.right + x, self.bottom + y)
 
     def overlaps(self, other: Box) -> bool:
@@ -109,21 +109,21 @@ class Box:
         return not (is_beside or self.bottom <= other.top or other.bottom <= self.top)
 
     def distance_to(self, x: float, y: float) -> float:
-        """Return the distance of a point, 0 within [mm]."""
+        """Return the distance of a point from the box, 0 inside [mm]."""
         dx = max(self.left - x, 0.0, x - self.right)
         dy = max(self.top - y, 0.0, y - self.bottom)
         return float((dx * dx + dy * dy) ** 0.5)
 
 
 def _is_seen(shape: Primitive, box: Box) -> bool:
-    """Whether a box shows some ink of a shape, not counting what lies on top of it."""
+    """Tell whether a box shows part of a shape, ignoring other shapes on top of it."""
     if isinstance(shape, Circle):
         nearest = box.distance_to(*shape.centre_mm)
         farthest = max(math.dist(shape.centre_mm, corner) for corner in box.corners)
         return nearest < shape.radius_mm and (shape.is_filled or farthest > shape.radius_mm)
     if isinstance(shape, Text):
         (x, y), size = shape.start_mm, shape.size_mm
-        width = min(shape.room_mm, _WIDEST_LETTER * size * len(shape.words))
+        width = min(shape.room_mm, _MAX_LETTER_WIDTH * size * len(shape.words))
         return Box(x, y - size, x + width, y + size).overlaps(box)
     pairs = (shape.points_mm,) if shape.is_filled else pairwise(shape.points_mm)
     return any(_around(points).grown(LINE_MM).overlaps(box) for points in pairs)
@@ -141,14 +141,14 @@ def filled_rectangle(layer: Layer, box: Box) -> Polyline:
 
 @dataclass(frozen=True, slots=True)
 class Artwork:
-    """All there is to print of one target, about its centre."""
+    """The complete print of one target; the origin is its centre."""
 
     shapes: tuple[Primitive, ...]  # in painting order
-    box: Box  # what has to be on the paper
-    white_mm: float = 0.0  # radius about the origin that has to be white paper
+    box: Box  # area that has to be on the paper
+    white_mm: float = 0.0  # radius about the origin within which the paper has to be white
 
     def shows_something(self, part: Box) -> bool:
-        """Whether there is ink in a part of the artwork, or white that the target needs."""
+        """Tell whether a part of the artwork has ink, or white that the target needs."""
         if part.distance_to(0.0, 0.0) < self.white_mm:
             return True
         inked = (shape for shape in self.shapes if getattr(shape, "layer", None) != Layer.WHITE)
@@ -157,12 +157,12 @@ class Artwork:
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """One sheet of paper; its own axes begin at its top left corner."""
+    """One sheet of paper; its origin is the top left corner."""
 
-    label: str  # of one sheet among several: `r1c2`, row and column; else empty
+    label: str  # row and column among several sheets, such as `r1c2`; empty for a single sheet
     width_mm: float
     height_mm: float
     artwork: Artwork
-    centre_mm: Point  # where the artwork's origin is on the sheet
+    centre_mm: Point  # place of the artwork's origin on the sheet
     window: Box  # the part of the sheet that shows the artwork
-    marks: tuple[Primitive, ...] = ()  # of the sheet itself
+    marks: tuple[Primitive, ...] = ()  # marks of the sheet, outside the artwork

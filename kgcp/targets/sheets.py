@@ -12,12 +12,12 @@ from kgcp.targets.rulers import THICK_MM, across, down
 from kgcp.targets.shapes import Artwork, Box, Primitive, Sheet, Text
 
 _MARGIN_MM = 10.0
-_TILE_MARGIN_MM = 15.0  # printers leave up to five white; the rest is for the marks
-_BLEED_MM = 3.0  # beyond the cut, so that no white line remains
+_TILE_MARGIN_MM = 15.0  # printers leave up to 5 mm blank; the rest is for the marks
+_BLEED_MM = 3.0  # artwork beyond the cut, so that no white line remains
 _MARK_GAP_MM, _MARK_MM = 5.0, 5.0
 _RULER_MM = 100.0
-_LARGEST_MM = 5000.0  # of a PDF page: 14400 pt
-_MOST_TILES = 400
+_MAX_PAGE_MM = 5000.0  # of PDF: 14400 pt
+_MAX_TILES = 400
 
 
 class Paper(StrEnum):
@@ -32,7 +32,7 @@ class Paper(StrEnum):
 
     @property
     def size_mm(self) -> tuple[float, float]:
-        """Width and height, upright, by ISO 216; not of `fit` [mm]."""
+        """Width and height in portrait format, by ISO 216; not defined for `fit` [mm]."""
         return {
             Paper.A4: (210.0, 297.0),
             Paper.A3: (297.0, 420.0),
@@ -48,20 +48,20 @@ def lay_out(artwork: Artwork, name: str, paper: Paper, *, is_tiled: bool) -> tup
     Parameters
     ----------
     name : str
-        Of the target, for messages and the margins of tiles.
+        Name of the target, for messages and the margins of tiles.
     is_tiled : bool
-        Whether several sheets may be used; one is, where it suffices.
+        Whether several sheets may be used if one does not suffice.
 
     Raises
     ------
     SettingError
-        If it does not fit.
+        If the artwork does not fit.
     """
     need_mm = artwork.box.width + 2.0 * _MARGIN_MM, artwork.box.height + 2.0 * _MARGIN_MM
     if paper is Paper.FIT:
         if is_tiled:
             raise SettingError("sheet", "'fit' is one sheet", "name the sheets of the tiles")
-        if max(need_mm) > _LARGEST_MM:
+        if max(need_mm) > _MAX_PAGE_MM:
             raise _too_large(name, need_mm, "a PDF page has at most 5 m", "make it smaller")
         return (_one_sheet(artwork, need_mm),)
     for size_mm in (paper.size_mm, paper.size_mm[::-1]):
@@ -72,7 +72,7 @@ def lay_out(artwork: Artwork, name: str, paper: Paper, *, is_tiled: bool) -> tup
         raise _too_large(name, need_mm, f"{paper} is smaller", remedy)
     plans = [_grid(artwork.box, size_mm) for size_mm in (paper.size_mm, paper.size_mm[::-1])]
     size_mm, rows, columns = min(plans, key=lambda plan: plan[1] * plan[2])
-    if rows * columns > _MOST_TILES:
+    if rows * columns > _MAX_TILES:
         remedy = "take larger sheets"
         raise _too_large(name, need_mm, f"it takes {rows * columns} sheets of {paper}", remedy)
     return tuple(_tiles(artwork, name, size_mm, rows, columns))
@@ -125,7 +125,7 @@ def _tiles(
 
 
 def _tile_marks(cut: Box, words: str) -> Iterator[Primitive]:
-    """Yield the marks around a tile: where to cut, which it is, and rulers."""
+    """Yield the marks around a tile: crop marks, its label, and rulers."""
     yield from crop_marks(cut, _MARK_GAP_MM, _MARK_MM)
     foot = cut.bottom + _MARK_GAP_MM + THICK_MM
     yield from across((cut.left + 4.0, foot), _RULER_MM, 1.0, is_marked=False)

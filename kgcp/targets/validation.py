@@ -1,4 +1,4 @@
-"""The targets of one flight: they must fit into each other, and be told apart."""
+"""Validation of a flight's targets: replicas must nest, and codes must be distinguishable."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from kgcp.errors import SettingError
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.targets.layout import Ring, Target
 
-_SAME_SHAPE = 0.1  # relative; ellipses of small targets do not show finer differences
+_SAME_SHAPE = 0.1  # relative difference; ellipses of small targets do not show smaller ones
 
 
 def check_targets(targets: Sequence[Target]) -> None:
-    """Refuse targets that no image could tell apart, or that overlap on one plate.
+    """Refuse targets that no image can distinguish, or that overlap on one plate.
 
     Raises
     ------
@@ -39,34 +39,35 @@ def check_targets(targets: Sequence[Target]) -> None:
 
 
 def same_shape(first: Ring, second: Ring) -> bool:
-    """Whether two rings look alike but for their size and code."""
+    """Tell whether two rings have the same proportions, apart from size and code."""
     pairs = zip(_proportions(first), _proportions(second), strict=True)
     return all(abs(a - b) <= _SAME_SHAPE * max(a, b) for a, b in pairs)
 
 
 def codes_coincide(first: Ring, second: Ring) -> bool:
-    """Whether some rotation lays every dot of one code at least half onto a dot of the other."""
+    """Tell whether some rotation puts every dot of one code at least half onto one of the other."""
     half_deg = min(first.dot_half_angle_deg, second.dot_half_angle_deg)
     codes, other = np.array([first.code_deg]), np.array(second.code_deg)
     return bool(rotations_coincide(codes, other, half_deg)[0])
 
 
 def rotations_coincide(codes: FloatArray, other: FloatArray, half_deg: float) -> BoolArray:
-    """Return which codes coincide with another one, as `codes_coincide`.
+    """Return which codes (m,) coincide with another one, as `codes_coincide`.
 
     Parameters
     ----------
     codes, other : (m, n) and (k,) array
         Directions of the dots, ascending [deg].
     half_deg : float
-        Half the angle that a dot takes on the code circle.
+        Half the angle that a dot subtends at the ring's centre.
     """
     count = codes.shape[1]
     if len(other) != count:
         return np.zeros(len(codes), dtype=np.bool_)
     turned = other[np.add.outer(np.arange(count), np.arange(count)) % count]
     offsets = turned - codes[:, None, :]
-    offsets = np.mod(offsets - offsets[..., :1] + 180.0, 360.0) - 180.0  # about the first dot's
+    # relative to the offset of the first dot
+    offsets = np.mod(offsets - offsets[..., :1] + 180.0, 360.0) - 180.0
     return np.asarray(np.ptp(offsets, axis=2).min(axis=1) <= 2.0 * half_deg)
 
 
