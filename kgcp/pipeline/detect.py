@@ -1,4 +1,8 @@
-"""Many frames, many processes, one ordered table, however often the work is interrupted."""
+"""Detection in all frames of a flight: the use case behind `kgcp detect`.
+
+Many processes examine the frames, and the results form one ordered table. An interrupted run is
+resumed.
+"""
 
 from __future__ import annotations
 
@@ -48,34 +52,34 @@ from kgcp.targets.plain import shape_of
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """How a flight is worked on. The table depends on `frame_patterns` and `places` alone.
+    """Options of a run. Only `frame_patterns` and `places` affect the table.
 
     Attributes
     ----------
     jobs : int or None
-        Worker processes; 0 works in this one, without a limit of time; None: as many as there are
-        cores, or as the scheduler has threads.
+        Number of worker processes; 0: this process, without a time limit; None: the number of
+        cores, or of the scheduler's threads.
     frame_timeout_s : float
-        Time for one look at one frame [s].
+        Time limit for one look at one frame [s].
     is_restart : bool
-        Whether to begin anew, whatever an interrupted run has left.
+        Whether to start over instead of resuming an interrupted run.
     is_profiled : bool
-        Whether to measure what the workers spend their time on, at the price of some.
+        Whether to measure the time of the workers' stages, which slows them down a little.
     scheduler : str or None
-        Of a Dask cluster that does the work: its address, or `local:N`. Its workers must see the
-        frames where they are seen here.
+        A Dask cluster that does the work: the scheduler's address, or `local:N`. Its workers must
+        see the frames under the same path as this machine.
     overlay : Path or None
-        Folder of a contact sheet of all rings, to be made after the table.
+        Folder of a contact sheet of all rings, which is made after the table.
     all_candidates : bool
         Whether the contact sheet also shows rings that were compared with a target's and dropped.
     stored_frames : StoredFolder or None
-        Where the frames are, if not in the flight's folder.
+        Place of the frames, if they are not in the flight's folder.
     frame_patterns : tuple of str
-        Of the frames that are wanted, see `matching_frames`; empty: all. The table has these alone
-        and says so.
+        Patterns of the wanted frames, see `matching_frames`; empty: all. The table has only these
+        frames, and states the patterns.
     places : Path or None
-        File of static targets that were marked by hand, see `read_marks`: plain targets are looked
-        for there in frames without a pose.
+        File of static targets that were marked by hand, see `read_marks`. In frames without a pose,
+        plain targets are searched for there.
     """
 
     jobs: int | None = None
@@ -113,8 +117,8 @@ _NEGATIVE = (
     "black and white are swapped in the frames or on the plate; give frames that are not negatives,"
     " or print the ring black on white"
 )
-_MOST_LOOKS = 4  # for plain targets, each by what the last one has found
-_STAGE_CALLERS = (examine_frame, examine)  # what their modules call are the stages of the work
+_MAX_LOOKS = 4  # looks for plain targets; each uses the results of the one before
+_STAGE_CALLERS = (examine_frame, examine)  # the functions that their modules call are the stages
 
 
 @single_threaded()
@@ -128,15 +132,15 @@ def detect_flight(
 ) -> DetectionSummary:
     """Examine every frame of a flight and write `detections.parquet`, and `run.json` beside it.
 
-    Frames without a target are looked at again where the others say that it must be. However the
-    work is interrupted, what was done is kept in a journal, and the same call goes on from there.
+    Where a target was not found, it is searched for again at the place that the other frames
+    predict. Results are kept in a journal, so that the same call resumes an interrupted run.
 
     Parameters
     ----------
     out : Path, optional
         Folder of the results; by default `kgcp` in the flight's folder.
     listener : ProgressListener, optional
-        Who is told how the work goes.
+        Receives notes and the progress.
 
     Returns
     -------
@@ -147,13 +151,13 @@ def detect_flight(
     ------
     KgcpError
         If there are no frames, a pattern matches none, a table of some frames would replace one of
-        all, the times file or that of the reference poses is bad, `out` cannot be written or is
-        another process's, the scheduler cannot be used, or the frames vanish.
+        all, the file of times or of reference poses is invalid, `out` cannot be written or is in
+        use by another process, the scheduler cannot be used, or frames disappear.
     """
     stopwatch = Stopwatch()
     out = results_folder(flight.folder) if out is None else Path(out)
     if options.scheduler is not None:
-        # as the folder is called in whatever folder another process works
+        # workers may run in another folder
         flight = replace(flight, frames_folder=flight.frames_folder.absolute())
     with stopwatch.stage("preparation"):
         task = _prepared_task(flight, settings, options)
@@ -203,21 +207,22 @@ def detect_flight(
             stages_s=_stages_s(stopwatch, journal, pool),
         )
         record = {**summary.numbers(), "jobs": pool.jobs, "settings": asdict(settings)}
-        write_run_record(out / "run.json", record)  # when all workers have ended: it has their peak
+        # after all workers have ended, because the record has their peak memory
+        write_run_record(out / "run.json", record)
         journal.remove()
     return summary
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _DetectionTask:
-    """A flight and what to do with it, before any frame is read."""
+    """A flight with settings and options, before any frame is read."""
 
     flight: Flight
     settings: DetectSettings
     options: RunOptions
     data: FlightData
     all_frames: Sequence[str]
-    inputs: Sequence[FrameInput]  # the frames that are wanted
+    inputs: Sequence[FrameInput]  # the wanted frames
     marks: Mapping[str, Sequence[HandMark]]  # of static targets, by frame
     sheet: ContactSheet | None
 
@@ -254,7 +259,7 @@ def _job_of(task: _DetectionTask) -> DetectionJob:
 def _kept_frames(
     out: Path, settings: DetectSettings, options: RunOptions
 ) -> AbstractContextManager[KeptFrames | None]:
-    """Return where frames are kept between looks: nowhere for other machines, or a single look."""
+    """Return the store of decoded frames; None for a single look, or if other machines work."""
     folder = out / ".detections.frames"
     is_one_look = not settings.is_guided and options.places is None
     if is_one_look or options.scheduler is not None:
@@ -264,9 +269,9 @@ def _kept_frames(
 
 
 def _frame_inputs(flight: Flight, data: FlightData, frames: Sequence[str]) -> list[FrameInput]:
-    """Return the frames with what is known of each before it is read."""
+    """Return the frames with prior knowledge of each."""
     times = data.frame_times.time_s
-    known = zip(
+    rows = zip(
         frames,
         priors_of_frames(flight, data, frames),
         plain_by_reference(flight, data, frames),
@@ -274,21 +279,21 @@ def _frame_inputs(flight: Flight, data: FlightData, frames: Sequence[str]) -> li
     )
     return [
         FrameInput(frame, times.get(frame), priors, flight.may_use_exif_times, plain)
-        for frame, priors, plain in known
+        for frame, priors, plain in rows
     ]
 
 
 def _measure_missing_targets(
     run: DetectionRun, task: _DetectionTask
 ) -> tuple[Mapping[int, Mapping[str, Prediction]], str | None]:
-    """Look where the first look, or marks, say that targets must be.
+    """Search for missing targets where the first look or marks predict them.
 
     Returns
     -------
     predictions : mapping of mappings
-        Of coded targets, by row and name.
+        Predictions of coded targets, by row and name.
     problem : str or None
-        What is wrong with what they are predicted by.
+        Error in the data from which they are predicted.
     """
     predictions: Mapping[int, Mapping[str, Prediction]] = {}
     problem = None
@@ -297,15 +302,15 @@ def _measure_missing_targets(
         predictions, problem = predict_missing(task.flight, task.data, run.tracks)
     run.guided_pass(predictions, {})
     if is_guided or task.marks:
-        _look_for_plain(run, task, _MOST_LOOKS if is_guided else 1)
+        _look_for_plain(run, task, _MAX_LOOKS if is_guided else 1)
     return predictions, problem
 
 
 def _look_for_plain(run: DetectionRun, task: _DetectionTask, looks: int) -> None:
-    """Look for plain targets where the frames' results say that they must be, until nothing is new.
+    """Search for plain targets where the results predict them, until there are no new predictions.
 
-    What is found in a frame tells where others are, in this one and in those beside it. Where that
-    is not sure enough, the first of these looks says so in the row; a later one may be sure.
+    A target that is found predicts others in its frame and in neighbouring frames. If a prediction
+    is too uncertain, the first look states this in the row; a later look may be certain.
     """
     tried: set[tuple[int, str]] = set()
     for look in range(looks):
@@ -324,7 +329,7 @@ def _look_for_plain(run: DetectionRun, task: _DetectionTask, looks: int) -> None
 
 
 def _likely_cause(run: DetectionRun, stopwatch: Stopwatch) -> str | None:
-    """Return why no target was found in any frame, if a trial tells."""
+    """Return why no target was found in any frame, if a trial with negatives shows it."""
     if not run.tracks.is_readable.any() or run.tracks.found:
         return None
     with stopwatch.stage("trial of negatives"):
@@ -398,7 +403,7 @@ def _dependencies(job: DetectionJob) -> dict[str, str]:
 
 
 def _frames_without_attitude(task: _DetectionTask) -> int:
-    """Return how many frames have no vehicle's attitude to tell which pose a level plate has."""
+    """Return the number of frames without an attitude that would decide a level plate's pose."""
     vehicle = task.flight.vehicle
     if vehicle is None or vehicle.settings.level_sd_deg is None:
         return 0
@@ -414,7 +419,7 @@ def _write_detections(
     task: _DetectionTask,
     predictions: Mapping[int, Mapping[str, Prediction]],
 ) -> SummaryBuilder:
-    """Write the table, and return the counts of its rows."""
+    """Write the table; return the counts of its rows."""
     left_out = set(task.all_frames).difference(each.frame for each in task.inputs)
     times = task.data.frame_times.time_s
     builder = SummaryBuilder({name: times[name] for name in times if name not in left_out})
@@ -440,6 +445,6 @@ def _rows(
 ) -> Iterator[Row]:
     shapes = {target.name: shape_of(target) for target in flight.all_targets}
     for row, result in enumerate(run.results()):
-        told = with_predictions(result, predictions.get(row, {}), flight.camera)
-        builder.add(told)
-        yield from detection_rows(told, shapes)
+        completed = with_predictions(result, predictions.get(row, {}), flight.camera)
+        builder.add(completed)
+        yield from detection_rows(completed, shapes)

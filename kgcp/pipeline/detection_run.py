@@ -1,8 +1,8 @@
-"""All frames of a flight looked at, once and again, by a pool of workers and into a journal.
+"""First and second look at all frames of a flight, by a pool of workers, with a journal of results.
 
-What an interrupted run has left in the journal is not done again. A key of the journal says all
-that a result depends on: the frame's file and what is known of it, and for a second look also what
-is expected. What all results depend on is the journal's own business.
+Results of an interrupted run are taken from the journal. The key of a result covers everything that
+it depends on: the frame's file and prior knowledge, and for a second look the predictions. The
+journal itself checks what all results depend on.
 """
 
 from __future__ import annotations
@@ -61,30 +61,31 @@ from kgcp.settings import Method
 
 _REASONS = {TaskFailure.CRASHED: Reason.WORKER_DIED, TaskFailure.TIMED_OUT: Reason.TIMED_OUT}
 
-_FIRST_BATCH = 8  # frames that are measured over both bases of an unknown tone curve
-_AT_ONCE = 256  # frames whose results are completed together: a tenth of the time for each
-_NEGATIVES = 12  # frames that are tried with black and white swapped
+_FIRST_BATCH = 8  # frames that are measured with both bases of an unknown tone curve
+# Frames whose results are completed together, which takes a tenth of the time per frame.
+_CHUNK_FRAMES = 256
+_NEGATIVE_FRAMES = 12  # frames that are tried with black and white swapped
 
 _Result = TypeVar("_Result")
 
 
 class ProgressListener(Protocol):
-    """Who is told how the work goes."""
+    """Receiver of notes and progress."""
 
     def note(self, text: str) -> None:
-        """Hear of something that the user should know, in one line."""
+        """Receive one line of information for the user."""
 
     def progress(self, stage: str, done: int, total: int, found: int) -> None:
-        """Hear how many frames of a stage are done, of how many, and how many show a target."""
+        """Receive the progress of a stage; `found` is the number of frames with a target so far."""
 
 
 class FirstSizes:
-    """The sizes of the first frames looked at: all wrong and the same, they are not this camera's.
+    """Check of the first frames' sizes: if all are wrong and equal, the camera is the wrong one.
 
     Parameters
     ----------
     frames : int
-        Of the flight. A short one is looked at to its end.
+        Number of frames of the flight. A short flight is examined to its end.
     """
 
     FRAMES = 20
@@ -92,11 +93,11 @@ class FirstSizes:
     def __init__(self, frames: int) -> None:
         self._seen = 0 if frames > self.FRAMES else self.FRAMES
         self._details: set[str] = set()
-        # size of the first `FRAMES` frames, and that of the camera; None: not all are wrong
+        # wrong size of all first `FRAMES` frames, and that of the camera; None: not all are wrong
         self.wrong: str | None = None
 
     def add(self, result: FrameResult) -> None:
-        """Take what the next frame was."""
+        """Add the result of the next frame."""
         if self._seen >= self.FRAMES:
             return
         self._seen += 1
@@ -110,12 +111,12 @@ class FirstSizes:
 
 
 class DetectionRun:
-    """The results of all frames, as far as they are there.
+    """The looks at all frames, and their results so far.
 
     Parameters
     ----------
     journal : Journal
-        Where results are kept, and may be.
+        Keeps the results, and may have some of an interrupted run.
     """
 
     def __init__(
@@ -135,22 +136,22 @@ class DetectionRun:
             for frame_input, stamp in zip(inputs, stamps, strict=True)
         }
         self._stamps = stamps
-        self._keys = [""] * len(inputs)  # empty of frames that were not looked at yet
+        self._keys = [""] * len(inputs)  # of the last results; empty: not examined yet
         self._stage, self._done, self._total = "", 0, 0
         # of the results so far
         self.tracks = FrameTracks(job.all_targets, [frame_input.frame for frame_input in inputs])
-        self.kept = 0  # frames whose first look the journal had
-        self.learnt: LearntImaging | None = None  # what `learn` has found of the camera
-        self._deciding_frames: set[str] = set()  # that have decided the base of the tone curve
+        self.kept = 0  # frames whose first look was in the journal
+        self.learnt: LearntImaging | None = None  # result of `learn`
+        self._deciding_frames: set[str] = set()  # frames that decided the base of the tone curve
         self._preferences: Mapping[Place, float] = {}
 
     def first_pass(self) -> None:
-        """Look at all frames that the journal has not.
+        """Examine all frames that are not in the journal.
 
         Raises
         ------
         KgcpError
-            If the first frames all have one size, which is not the camera's, or frames vanish.
+            If the first frames all have the same size, but not the camera's, or frames disappear.
         """
         sizes = FirstSizes(len(self._inputs))
         has_begun = False
@@ -159,26 +160,26 @@ class DetectionRun:
                 self._settle_tone_base()
             todo = [row for row in rows if not self._is_kept(row, sizes)]
             if todo and not has_begun:
-                self._tell_what_is_kept()
+                self._report_kept_results()
                 self._begin("first look", self.kept, len(self._inputs))
                 has_begun = True
-            elif has_begun:  # kept from before, after a frame that was not
+            elif has_begun:  # results of the journal after frames that were not in it
                 self._advance(len(rows) - len(todo))
             self._look_at(todo, sizes)
         if not has_begun:
-            self._tell_what_is_kept()
+            self._report_kept_results()
             self._begin("first look", self.kept, len(self._inputs))
 
     def _batches(self) -> list[list[int]]:
-        """Return the rows in the batches after which is asked what they say of the tone curve.
+        """Return the rows in batches; after each, the base of the tone curve may be decided.
 
-        Each batch lies evenly among all frames and is as large as all before it: what decides
-        depends neither on the number of workers nor on interruptions.
+        Each batch is evenly distributed over all frames and as large as all batches before it. So
+        the decision depends neither on the number of workers nor on interruptions.
         """
         count, camera = len(self._inputs), self._job.camera
         settings = self._job.settings
-        is_asked = settings.is_learning and settings.method is Method.MODEL
-        if not is_asked or camera.response is not Response.UNKNOWN:
+        may_decide = settings.is_learning and settings.method is Method.MODEL
+        if not may_decide or camera.response is not Response.UNKNOWN:
             return [[*range(count)]]
         spread = sorted(range(count), key=_bits_reversed)
         batches, first, last = [], 0, _FIRST_BATCH
@@ -188,7 +189,7 @@ class DetectionRun:
         return batches
 
     def _is_kept(self, row: int, sizes: FirstSizes) -> bool:
-        """Take the result of a frame from the journal, if it is there."""
+        """Take the result of a frame from the journal; tell whether it was there."""
         key = self._key(row, self._job.tone_base)
         self._keys[row] = key
         kept = self._journal.get(key)
@@ -218,7 +219,7 @@ class DetectionRun:
                         )
 
     def _settle_tone_base(self) -> None:
-        """Settle the base of frames that are not looked at yet, if those so far tell it."""
+        """Decide the tone base for the remaining frames, if the results so far allow it."""
         if self._job.tone_base is None:
             results = [*self._results_so_far()]
             base = clearly_agreed_base(results) or base_if_distances_agree(results)
@@ -238,15 +239,19 @@ class DetectionRun:
         Parameters
         ----------
         predictions, plain : mapping of mappings
-            By row and target, of those with a code and of those without.
+            Predictions of coded and of plain targets, by row and target.
         """
         visible: dict[int, dict[str, Prediction]] = {}
         for row, by_target in predictions.items():
             if self.tracks.is_readable[row]:
                 camera = self._job.camera
-                named = {name: one for name, one in by_target.items() if one.is_visible(camera)}
-                if named:
-                    visible[row] = named
+                in_frame = {
+                    name: prediction
+                    for name, prediction in by_target.items()
+                    if prediction.is_visible(camera)
+                }
+                if in_frame:
+                    visible[row] = in_frame
         keys = {}
         for row in sorted({*visible, *plain}):
             predicted = visible.get(row, {}), plain.get(row, {})
@@ -284,17 +289,18 @@ class DetectionRun:
     def is_negative(self) -> bool:
         """Tell whether a target is measured in some frames if black and white are swapped."""
         readable = np.flatnonzero(self.tracks.is_readable)
-        some = readable[:: math.ceil(len(readable) / _NEGATIVES) or 1]
-        inputs = (self._inputs[row] for row in some)
+        sample = readable[:: math.ceil(len(readable) / _NEGATIVE_FRAMES) or 1]
+        inputs = (self._inputs[row] for row in sample)
         with closing(self._pool.map(partial(shows_negative, self._job), inputs)) as results:
             return any(result is True for _, result in results)
 
     def learn(self) -> None:
-        """Find out what the frames say of each other; `results` follow it from now on.
+        """Learn from all frames together; `results` are updated by it from now on.
 
-        All of them together say what the tone curve is near to, and those before and after a frame
-        which of two normals is the likelier one, as far as the settings ask for either. What is
-        learnt of smoothing along contours turns normals by far less than neighbours differ.
+        All frames together tell which known curve the tone curve is close to. The frames before and
+        after a frame tell which of its two normals is more likely. Settings may turn off either.
+        For the choice of normals, the learnt smoothing along contours is ignored: it changes
+        normals by far less than they differ between neighbouring frames.
         """
         results = [*self._results_so_far()]
         if self._job.settings.is_learning:
@@ -308,12 +314,12 @@ class DetectionRun:
             )
 
     def results(self) -> Iterator[FrameResult]:
-        """Yield the last result of every frame, in the frames' order."""
-        for first in range(0, len(self._keys), _AT_ONCE):
-            yield from self._completed_as_learnt(self._keys[first : first + _AT_ONCE])
+        """Yield the latest result of every frame, in the frames' order."""
+        for first in range(0, len(self._keys), _CHUNK_FRAMES):
+            yield from self._completed_as_learnt(self._keys[first : first + _CHUNK_FRAMES])
 
     def _completed_as_learnt(self, keys: Sequence[str]) -> Iterator[FrameResult]:
-        """Yield results by what is learnt, with what follows from the poses that it changes."""
+        """Yield results updated by what is learnt, including what depends on changed poses."""
         results = [*map(self._journal.read, keys)]
         learnt = [
             self._as_learnt(result.frame, outcome)
@@ -372,9 +378,9 @@ class DetectionRun:
         self._listener.progress(self._stage, self._done, self._total, self.tracks.found)
 
     def _require_frame(self, result: FrameResult) -> None:
-        """Stop where frames cannot be read because they are gone, with the disk they were on."""
+        """Stop if a frame cannot be read because it has disappeared, perhaps with its disk."""
         path = self._job.frames_folder / result.frame
-        if not isinstance(path, Path):  # a store says itself why it cannot be read
+        if not isinstance(path, Path):  # an object store raises its own errors
             return
         if any(map(is_unreadable, result.outcomes)) and not os.path.lexists(path):
             raise KgcpError(
@@ -382,7 +388,7 @@ class DetectionRun:
                 " resumes"
             )
 
-    def _tell_what_is_kept(self) -> None:
+    def _report_kept_results(self) -> None:
         if self._journal.changes:
             changes = ", ".join(self._journal.changes)
             self._listener.note(
@@ -402,9 +408,9 @@ class DetectionRun:
             elif _name_of(keys[0]) in names:
                 changed += 1
         if self.kept or later or changed:
-            most = "up to " if later and not is_settled else ""
+            up_to = "up to " if later and not is_settled else ""
             self._listener.note(
-                f"resuming an interrupted run: results of {most}{self.kept + later} of"
+                f"resuming an interrupted run: results of {up_to}{self.kept + later} of"
                 f" {len(self._keys)} frames are kept, {changed} have changed since"
             )
 
@@ -428,10 +434,10 @@ def _bits_reversed(number: int) -> int:
 
 
 def _name_of(key: str) -> str:
-    """Return the part of a first look's key that says which frame it is."""
+    """Return the part of a first look's key that identifies the frame."""
     return key.rpartition("-")[0]
 
 
 def _key_of_lost(key: str) -> str:
-    """Return a key that no other run finds: it will try again."""
+    """Return a key that no other run can find, so that it tries again."""
     return f"lost-{os.getpid()}-{time.time_ns()}-{key}"

@@ -1,4 +1,4 @@
-"""What a flight's data say about each frame: its plate, and how the camera moves meanwhile."""
+"""Prior knowledge of each frame from a flight's data: normals of plates and the camera's motion."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ Priors = Mapping[str, PlatePrior]
 
 
 def priors_of_frames(flight: Flight, data: FlightData, frames: Sequence[str]) -> list[Priors]:
-    """Return for each frame what is known of its targets, by their names.
+    """Return for each frame the priors of its targets, by their names.
 
-    Detecting needs neither reference poses nor a trajectory: where the files cannot be used,
-    nothing is known. Commands that need them say what is wrong with them.
+    Detection needs neither reference poses nor a trajectory. If their files cannot be used, there
+    are no priors; commands that need the files report the error.
 
     Raises
     ------
@@ -56,13 +56,13 @@ def priors_of_frames(flight: Flight, data: FlightData, frames: Sequence[str]) ->
     unknown: list[NormalPrior | None] = [None] * len(frames)
     priors: list[Priors] = []
     for row in range(len(frames)):
-        known = {
+        in_frame = {
             target.name: PlatePrior(
                 by_target.get(target.name, unknown)[row], rotations[target.name].get(row)
             )
             for target in flight.all_targets
         }
-        priors.append({name: prior for name, prior in known.items() if prior != PlatePrior()})
+        priors.append({name: prior for name, prior in in_frame.items() if prior != PlatePrior()})
     return priors
 
 
@@ -84,7 +84,7 @@ def _normals(
         return [None] * len(frames)
     vehicle: Vehicle | None = None
     if poses is not None and data.has_position_of(moving[0]):
-        with suppress(KgcpError):  # a plate that is said to be level does without a trajectory
+        with suppress(KgcpError):  # a level plate needs no trajectory
             vehicle = data.target_positions.vehicle
     attitudes = CameraAttitudes(poses, flight.plumb_sd_deg)
     return normal_priors(frames, time_s, attitudes, vehicle, level_sd_deg)
@@ -96,7 +96,7 @@ def _with_rates(
     frames: Sequence[str],
     by_frames_around: Mapping[int, SceneRotation],
 ) -> dict[int, SceneRotation]:
-    """Combine the camera's rates of the times file with those from the frames around."""
+    """Combine the camera's rotation rates in the times file with those from adjacent frames."""
     rotations = dict(by_frames_around)
     unknown, rates = SceneRotation.unknown(flight.camera), data.scene_rotations
     for row, frame in enumerate(frames):
@@ -113,7 +113,7 @@ def _rotations(
     time_s: Sequence[float | None],
     target: AnyTarget,
 ) -> dict[int, SceneRotation]:
-    """Return by row how the scene about a target turns while the frame is read."""
+    """Return by row the rotation of the scene about a target while the frame is read out."""
     camera = flight.camera
     if not camera.readout_s or not data.has_reference or not data.has_position_of(target):
         return {}
@@ -164,9 +164,9 @@ def motions_while_read(
     local_frame: LocalFrame,
     attempts: Sequence[Attempt],
 ) -> CameraMotions | None:
-    """Return how the camera moves while frames with poses are read, in the poses' order.
+    """Return the motion of the camera while frames are read out, in the order of their poses.
 
-    None: the frames are exposed at once, or nothing was measured.
+    None: there is no rolling shutter, or nothing was measured.
     """
     distances_m = [attempt.sighting.distance_m for attempt in attempts if attempt.sighting]
     if not flight.camera.readout_s or not distances_m:

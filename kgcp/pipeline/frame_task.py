@@ -1,4 +1,4 @@
-"""One frame: read, measured, looked at again; and what it is when that ends its process."""
+"""Tasks for one frame: first and second look, and the results if they end their process."""
 
 from __future__ import annotations
 
@@ -41,74 +41,74 @@ from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
 from kgcp.targets.plain import AnyTarget, PlainTarget
 
-_MOST_DROPPED = 24  # rings per frame that are kept to be shown: a texture may have hundreds
+_MAX_DROPPED = 24  # dropped rings per frame that are kept to be shown; textures may have hundreds
 
 
 @dataclass(frozen=True, slots=True)
 class DetectionJob:
-    """What a worker needs to know to examine any frame of a flight."""
+    """Everything that a worker needs to examine any frame of a flight."""
 
     frames_folder: Path | StoredFolder
     camera: Camera
     calibration_covariance: CalibrationCovariance | None
     targets: tuple[Target, ...]
     settings: DetectSettings
-    # whether the results name the rings that were compared with a target's and dropped
+    # whether the results include rings that were compared with a target's and dropped
     keeps_dropped: bool = False
     plain_targets: tuple[PlainTarget, ...] = ()
-    # of frames that may be looked at again; None: they are decoded again
+    # decoded frames kept for a second look; None: they are decoded again
     kept_frames: KeptFrames | None = None
-    # what an unknown tone curve departs from, once enough frames have told it
+    # known curve to which an unknown tone curve is a correction; None: not decided yet
     tone_base: ToneBase | None = None
 
     @property
     def all_targets(self) -> tuple[AnyTarget, ...]:
-        """Those with a code, then those without: the order of a frame's outcomes."""
+        """Coded targets, then plain ones: the order of a frame's outcomes."""
         return (*self.targets, *self.plain_targets)
 
     def target_of(self, measurement: Measurement) -> AnyTarget:
-        """Return what was measured."""
+        """Return the target that was measured."""
         return next(target for target in self.all_targets if target.name == measurement.target)
 
     def priors(self, frame_input: FrameInput) -> Mapping[str, PlatePrior]:
-        """Return what is known of a frame's targets, by their names."""
-        known = frame_input.priors
+        """Return the priors of a frame's targets, by their names."""
+        priors = frame_input.priors
         if self.tone_base is None:
-            return known
+            return priors
         return {
-            target.name: replace(known.get(target.name, PlatePrior()), tone_base=self.tone_base)
+            target.name: replace(priors.get(target.name, PlatePrior()), tone_base=self.tone_base)
             for target in self.targets
         }
 
 
 @dataclass(frozen=True, slots=True)
 class FrameInput:
-    """What a worker needs to know about one frame."""
+    """Everything that a worker needs to know about one frame."""
 
     frame: str  # path relative to the frames folder
-    # from the times file, of the camera's `time_reference`, Unix UTC [s]; None: it has none
+    # time in the times file, at the camera's `time_reference`, Unix UTC [s]; None: it has none
     time_s: float | None
-    priors: Mapping[str, PlatePrior]  # what is known of its targets, by their names
+    priors: Mapping[str, PlatePrior]  # of its targets, by their names
     may_use_exif_time: bool = True  # whether EXIF gives the time if the times file does not
-    # where plain targets must be, by their names
+    # predictions of plain targets, by their names
     plain: Mapping[str, PlainPrediction] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class GuidedInput:
-    """A frame that is to be looked at again."""
+    """A frame for a second look."""
 
     input: FrameInput
     first: FrameResult  # of the first look
-    # by the name of the target, which must be visible; those that are looked for
+    # predictions of missing coded targets, which must be visible, by their names
     predictions: Mapping[str, Prediction]
-    # where plain targets must be, as the targets of the first look say it
+    # predictions of plain targets from the targets of the first look, by their names
     plain: Mapping[str, PlainPrediction] = field(default_factory=dict)
 
 
 @single_threaded()
 def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
-    """Read and measure one frame; whatever a frame can do wrong becomes its result."""
+    """Read and measure one frame; errors of the frame become its result."""
     exif = Exif()
     outcomes: tuple[Outcome, ...]
     dropped: tuple[Considered, ...] = ()
@@ -147,7 +147,7 @@ def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
 def _frame_time(
     job: DetectionJob, frame_input: FrameInput, exif: Exif, *, is_readable: bool
 ) -> tuple[float | None, TimeSource]:
-    """Return the mid-exposure of a frame [s], and where it is from."""
+    """Return the mid-exposure of a frame [s] and its source."""
     time_s, time_source = frame_input.time_s, TimeSource.TIMES_FILE
     if time_s is None and frame_input.may_use_exif_time:
         time_s, time_source = exif.time_s, TimeSource.EXIF
@@ -218,10 +218,10 @@ def shows_negative(job: DetectionJob, frame_input: FrameInput) -> bool:
 
 
 def lost_frame(job: DetectionJob, frame_input: FrameInput, reason: Reason) -> FrameResult:
-    """Return the result of a frame that cannot be examined without the end of the process."""
+    """Return the result of a frame whose examination ends the process."""
     outcomes = tuple(Miss(target.name, reason) for target in job.all_targets)
-    is_known = job.camera.time_reference is TimeReference.MIDDLE
-    time_s = frame_input.time_s if is_known else None
+    is_middle = job.camera.time_reference is TimeReference.MIDDLE
+    time_s = frame_input.time_s if is_middle else None
     time_source = TimeSource.NONE if time_s is None else TimeSource.TIMES_FILE
     return FrameResult(
         frame_input.frame, time_s, ExposureSettings(), outcomes, time_source=time_source
@@ -229,7 +229,7 @@ def lost_frame(job: DetectionJob, frame_input: FrameInput, reason: Reason) -> Fr
 
 
 def result_without_second_look(guided_input: GuidedInput, reason: Reason) -> FrameResult:
-    """Return the result of the first look, where the second one ended its process."""
+    """Return the result of the first look for a frame whose second look ended the process."""
     outcomes = tuple(
         replace(outcome, detail="; ".join(filter(None, (outcome.detail, f"second look: {reason}"))))
         if isinstance(outcome, Miss)
@@ -242,7 +242,7 @@ def result_without_second_look(guided_input: GuidedInput, reason: Reason) -> Fra
 def _predicted(
     frame_input: FrameInput, plain: Mapping[str, PlainPrediction], target: PlainTarget
 ) -> PlainPrediction | None:
-    """Return where a plain target must be, with what is known of the scene's rotation."""
+    """Return the prediction of a plain target, completed by the scene's rotation if known."""
     prediction, prior = plain.get(target.name), frame_input.priors.get(target.name)
     if prediction is None or prior is None:
         return prediction
@@ -256,7 +256,7 @@ def _outcomes_of_second_look(
     by_target: Mapping[str, Measurement],
     considered: Sequence[Considered],
 ) -> tuple[Outcome, ...]:
-    """Return the outcomes of coded targets, then of plain ones where they are predicted now."""
+    """Return the outcomes of coded targets, and of plain ones that are predicted by now."""
     outcomes = _coded_outcomes(job, guided_input, grey, by_target, considered)
     measured = [outcome for outcome in outcomes if isinstance(outcome, Measurement)]
     plain: dict[str, Outcome] = {}
@@ -287,14 +287,14 @@ def _coded_outcomes(
     Parameters
     ----------
     measured : mapping of str to Measurement
-        Of both looks, by target.
+        Measurements of both looks, by target.
     considered : sequence of Considered
-        Rings that the second look has compared with a target.
+        Rings that the second look compared with a target.
     """
     first_outcomes = guided_input.first.outcomes
     misses = {outcome.target: outcome for outcome in first_outcomes if isinstance(outcome, Miss)}
     missing = tuple(target for target in job.targets if target.name not in measured)
-    if misses.keys() & measured.keys():  # rings on those plates explain no other's miss any more
+    if misses.keys() & measured.keys():  # rings on these plates no longer explain other misses
         plates = tuple(measured.values())
         again = examine(
             grey, job.camera, missing, job.settings, job.priors(guided_input.input), plates
@@ -314,8 +314,8 @@ def _coded_outcomes(
             if code_like
             else misses[target.name]
         )
-    found_now = [measured[name] for name in misses if name in measured]
-    replacements |= {outcome.target: outcome for outcome in completed(job, found_now)}
+    new = [measured[name] for name in misses if name in measured]
+    replacements |= {outcome.target: outcome for outcome in completed(job, new)}
     return tuple(
         replacements.get(outcome.target, outcome) if isinstance(outcome, Miss) else outcome
         for outcome in first_outcomes
@@ -323,12 +323,12 @@ def _coded_outcomes(
 
 
 def _best_dropped(considered: Sequence[Considered]) -> tuple[Considered, ...]:
-    """Return the dropped rings that came farthest, one per outline."""
+    """Return the dropped rings that passed most tests, one per outline."""
     dropped = (ring for ring in considered if ring.reason is not None)
     best: dict[Ellipse, Considered] = {}
     for ring in sorted(dropped, key=lambda ring: (not ring.is_match, -ring.score)):
         best.setdefault(ring.outline, ring)
-    return tuple(best.values())[:_MOST_DROPPED]
+    return tuple(best.values())[:_MAX_DROPPED]
 
 
 def _mid_exposure_s(
@@ -347,9 +347,9 @@ def _mid_exposure_s(
 
 
 def completed(job: DetectionJob, outcomes: Sequence[Outcome]) -> tuple[Outcome, ...]:
-    """Return outcomes with what follows from their poses: common uncertainty and eccentricity.
+    """Add to outcomes what follows from their poses: common uncertainty and eccentricity.
 
-    Those of many frames may be given at once, which takes a tenth of the time for each.
+    Outcomes of many frames may be passed at once, which takes a tenth of the time per frame.
     """
     measured = [outcome for outcome in outcomes if isinstance(outcome, Measurement)]
     eccentricities_px = iter(_eccentricities_px(job, measured))
@@ -368,7 +368,7 @@ def completed(job: DetectionJob, outcomes: Sequence[Outcome]) -> tuple[Outcome, 
 
 
 def _eccentricities_px(job: DetectionJob, measured: Sequence[Measurement]) -> FloatArray:
-    """Return how far the centroids of outer circles are from their centres (n, 2) [px]."""
+    """Return the offsets (n, 2) of outer circles' centroids from their centres [px]."""
     if not measured:
         return np.empty((0, 2))
     poses = [measurement.pose for measurement in measured]
@@ -380,6 +380,6 @@ def _eccentricities_px(job: DetectionJob, measured: Sequence[Measurement]) -> Fl
     )
     eccentricities_px = eccentricity(job.camera, circles).total_px
     for i, measurement in enumerate(measured):
-        if measurement.image is not None:  # of a plain target: measured itself
+        if measurement.image is not None:  # of plain targets, the centroid itself is measured
             eccentricities_px[i] = measurement.image.moments[:2] - measurement.centre_px
     return eccentricities_px

@@ -1,4 +1,4 @@
-"""Where the targets of a flight must be in the frames in which they were not found."""
+"""Prediction of a flight's targets in frames in which they were not found."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from kgcp.measurement.records import FrameResult, Measurement, Miss, is_unreadab
 from kgcp.network.ground.frame_poses import orient_frames, print_scale_sd
 from kgcp.targets.plain import AnyTarget
 
-# What a ring that is not the target's may be dropped for.
+# Reasons for which rings that do not belong to the target may be dropped.
 _NO_TARGET = {
     *(Reason.NO_CANDIDATE, Reason.CODE_MISMATCH, Reason.OTHER_CODE, Reason.TOO_SMALL),
     *(Reason.TOO_BLURRED, Reason.CLIPPED, Reason.HIDDEN, Reason.CUT),
@@ -37,7 +37,7 @@ _NO_TARGET = {
 
 
 class FrameTracks:
-    """What all frames must know of each other for a second look: few numbers of every frame."""
+    """The few numbers of every frame that predictions for other frames need."""
 
     def __init__(self, targets: Sequence[AnyTarget], frames: Sequence[str]) -> None:
         self.frames = frames
@@ -45,11 +45,11 @@ class FrameTracks:
         # (n, 3) by the target's name, as in `Track`
         self.states = {target.name: np.full((len(frames), 3), math.nan) for target in targets}
         self.is_readable = np.zeros(len(frames), dtype=np.bool_)  # whether there is an image
-        self.found = 0  # frames in which any target was measured
+        self.found = 0  # number of frames in which any target was measured
         self._is_found = np.zeros(len(frames), dtype=np.bool_)
 
     def add(self, row: int, result: FrameResult) -> None:
-        """Take what is needed from the result of a frame."""
+        """Add the result of a frame, or replace its former result."""
         self.time_s[row] = math.nan if result.time_s is None else result.time_s
         self.is_readable[row] = not any(map(is_unreadable, result.outcomes))
         measured = [each for each in result.outcomes if isinstance(each, Measurement)]
@@ -63,14 +63,14 @@ class FrameTracks:
 def predict_missing(
     flight: Flight, data: FlightData, tracks: FrameTracks
 ) -> tuple[dict[int, dict[str, Prediction]], str | None]:
-    """Return, for each frame, where its missing targets must be, as far as that is sure.
+    """Return predictions of missing coded targets, as far as they are certain enough.
 
     Returns
     -------
-    expected : dict of dict
-        By the frame's row and the target's name; rows of which nothing is expected are left out.
+    predictions : dict of dict
+        By the frame's row and the target's name; rows without predictions are left out.
     problem : str or None
-        What is wrong with reference poses or trajectory. Detection needs neither: not an error.
+        Error in reference poses or trajectory. It is not raised, because detection needs neither.
     """
     predictions: dict[int, dict[str, Prediction]] = {}
     problem = None
@@ -100,7 +100,7 @@ def predict_missing(
 def plain_by_reference(
     flight: Flight, data: FlightData, frames: Sequence[str]
 ) -> list[Predictions]:
-    """Return for each frame where its plain targets must be, by the reference poses.
+    """Return for each frame the predictions of its plain targets by the reference poses.
 
     Raises
     ------
@@ -127,21 +127,21 @@ def plain_by_results(
     marks: Mapping[str, Sequence[HandMark]],
     tried: Collection[tuple[int, str]] = (),
 ) -> dict[int, Predictions]:
-    """Return by row where plain targets must be of which nothing else has said it so far.
+    """Return by row predictions of plain targets that have had no certain prediction so far.
 
-    The frame's other static targets orient it; else marks tell the places of those that are marked;
-    else the frames before and after do.
+    There are three sources, the best first: the pose of the frame by its other static targets,
+    marks by hand, and the frames before and after.
 
     Parameters
     ----------
     results : iterable of FrameResult
-        Of all n frames, in their order: what was measured so far.
+        Results of all n frames so far, in the frames' order.
     time_s : (n,) array
-        Mid-exposures [s]; NaN: not known.
+        Mid-exposures [s]; NaN: unknown.
     marks : mapping
         Static targets that were marked by hand, by frame.
     tried : collection of tuple
-        Rows and targets that were looked for before, by a sure prediction.
+        Rows and targets that were already searched for with a certain prediction.
     """
     if not flight.plain_targets or flight.crs is None:
         return {}
@@ -165,14 +165,14 @@ def plain_by_results(
     if not lacking:
         return {}
     by_neighbours = tracks.predictions(flight.camera, lacking)
-    by_targets = _by_own_targets(flight, data, [*rows], sightings)
-    made: dict[int, Predictions] = {}
+    by_targets = _by_other_targets(flight, data, [*rows], sightings)
+    predictions: dict[int, Predictions] = {}
     for frame, row in rows.items():
         places = {mark.target: mark.place for mark in marks.get(frame, ())}
         by_marks = predict_marked(
             flight.plain_targets, places, data.static_positions, flight.camera
         )
-        # later sources are better ones, if they are sure
+        # later entries win: certain predictions, and then better sources
         sources = (by_neighbours.get(row, {}), by_marks, by_targets.get(frame, {}))
         best = {
             name: each
@@ -182,15 +182,15 @@ def plain_by_results(
             if name in lacking[row] and each.is_sure is is_sure
         }
         if best:
-            made[row] = best
-    return made
+            predictions[row] = best
+    return predictions
 
 
-def _by_own_targets(
+def _by_other_targets(
     flight: Flight, data: FlightData, frames: Sequence[str], sightings: Sequence[Sighting]
 ) -> dict[str, Predictions]:
-    """Return by frame where plain targets must be, as other static targets orient it."""
-    made: dict[str, Predictions] = {}
+    """Return by frame the predictions of plain targets by the pose from other static targets."""
+    predictions: dict[str, Predictions] = {}
     positions = data.static_positions
     for oriented in orient_frames(
         frames,
@@ -207,19 +207,19 @@ def _by_own_targets(
                 oriented.cov,
                 "the frame's other targets",
             )
-            made[oriented.frame] = predict_plain(
+            predictions[oriented.frame] = predict_plain(
                 flight.plain_targets, orientation, positions, flight.camera
             )
-    return made
+    return predictions
 
 
 def with_predictions(
     result: FrameResult, predictions: Mapping[str, Prediction], camera: Camera
 ) -> FrameResult:
-    """Add to the misses where the target must have been; outside the frame that is the reason.
+    """Add predictions to misses; if the target is outside the frame, this becomes the reason.
 
-    A ring that is in the frame then is something else. One that carried the code and failed later
-    contradicts the prediction, and keeps its reason.
+    A ring in the frame is then something else. But a ring that had the right code and failed a
+    later test contradicts the prediction, and keeps its reason.
     """
     outcomes = tuple(
         _with_prediction(outcome, predictions[outcome.target], camera)
@@ -233,12 +233,12 @@ def with_predictions(
 
 
 def is_out_of_view(reason: Reason, prediction: Prediction, camera: Camera) -> bool:
-    """Tell whether a target is outside the frame, and a ring in the frame is something else.
+    """Tell whether a target is outside the frame, so that rings in it are something else.
 
     Parameters
     ----------
     reason : Reason
-        Of the miss, by the frame itself.
+        Reason of the miss without the prediction.
     """
     return prediction.is_outside(camera) and reason in _NO_TARGET
 

@@ -1,4 +1,4 @@
-"""All rings of a flight as a contact sheet: what was fitted, what that leaves, and the values."""
+"""Contact sheet of all rings of a flight: fitted contours, residuals and values."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ _CIRCLE = np.stack((np.cos(_TURN), np.sin(_TURN)), axis=-1)
 
 @dataclass(frozen=True, slots=True)
 class Sketch:
-    """One card of the sheet, to be written."""
+    """One card of the sheet before it is written."""
 
-    card: Card  # without the name of a picture
-    # None: nothing says where a ring is, or the frame could not be read again
+    card: Card  # without the name of its picture
+    # None: the place of the ring is unknown, or the frame could not be read again
     pictures: Pictures | None = None
-    is_lost: bool = False  # whether there should be pictures
+    is_lost: bool = False  # whether pictures are missing because the frame could not be read again
 
 
 def draw_overlay(
@@ -56,19 +56,19 @@ def draw_overlay(
     job: DetectionJob,
     predictions: Mapping[int, Mapping[str, Prediction]],
 ) -> int:
-    """Draw the last result of every frame, and write the page.
+    """Draw the latest result of every frame, and write the page.
 
-    Workers draw; this process writes their pictures as they come, and keeps only the cards' texts.
+    Workers draw. This process writes their pictures as they arrive, and keeps only the cards.
 
     Parameters
     ----------
     predictions : mapping of mappings
-        Where targets must be, by row and target: added to the texts of misses.
+        Predictions by row and target, which are added to the texts of misses.
 
     Returns
     -------
     int
-        Rings that could not be drawn, since their frame could not be read again.
+        Number of rings that could not be drawn because their frame could not be read again.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def draw_overlay(
 
 
 def _with_prediction(card: Card, predictions: Mapping[str, Prediction], camera: Camera) -> Card:
-    """Add to the card of a miss where its target must have been."""
+    """Add the prediction of its target to the card of a miss."""
     if card.target not in predictions or card.status not in _MISSES:
         return card
     prediction = predictions[card.target]
@@ -114,7 +114,7 @@ def _with_prediction(card: Card, predictions: Mapping[str, Prediction], camera: 
 def sketch_frame(job: DetectionJob, result: FrameResult) -> list[Sketch]:
     """Read a frame again and draw all rings of its result, in the order of the table's rows.
 
-    Rings that were dropped follow, those that came farthest first.
+    Dropped rings follow, those that passed most tests first.
     """
     rings = _rings(result)
     if not any(_has_place(ring) for ring in rings):
@@ -128,7 +128,7 @@ def sketch_frame(job: DetectionJob, result: FrameResult) -> list[Sketch]:
 
 
 def _rings(result: FrameResult) -> list[Outcome | Considered]:
-    """Return the contents of the cards: all outcomes, and rejected rings but the best of a miss."""
+    """Return the contents of the cards: all outcomes, then dropped rings that no miss shows."""
     outcomes = sorted(
         result.outcomes,
         key=lambda outcome: (outcome.target, 0 if isinstance(outcome, Miss) else outcome.instance),
@@ -188,7 +188,7 @@ def _plain_sketch(
 
 
 def _dropped_view(grey: GreyArray, outline: Ellipse, target: Target) -> RingView:
-    """Show a ring that was dropped, with the dots of the target's ring that it resembles most."""
+    """Return the view of a dropped ring with the dots of the most similar ring of the target."""
     patch = polar_patch(grey, outline)
     matches = [(match_templates(patch, ring, outline.mean_radius), ring) for ring in target.rings]
     best, ring = max(matches, key=lambda pair: pair[0].score)
@@ -250,7 +250,7 @@ def _measured_card(
 
 
 def _values(observation: Measurement, residual_percent: float | None) -> Iterator[str]:
-    """Yield the values in few words; those that are not known are left out."""
+    """Yield the values as short texts; unknown ones are left out."""
     appearance, spread = observation.appearance, observation.uncertainty
     x, y = observation.centre_px
     sd = "" if spread is None else f" ± {np.sqrt(np.diag(spread.centre_cov_px2).max()):.3f}"

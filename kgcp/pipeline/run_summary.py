@@ -1,4 +1,4 @@
-"""What is counted and timed over all frames."""
+"""Counts and times of a detection run over all frames."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from kgcp.io.formats.frame_names import likely_difference
 from kgcp.measurement.records import FrameResult, Miss, TimeSource
 from kgcp.quality.learnt_imaging import LearntImaging
 
-_KEPT_DETAILS = 1000  # per reason: numbers differ from frame to frame
+_MAX_DETAILS = 1000  # different details kept per reason; numbers in them differ between frames
 _PLACE = re.compile(r"ring at \([^)]*\), radius [\d.]+ px(, |: |$)")
 _PREDICTION = re.compile(r"(^|; )expected by .*")
 _NUMBERS_OF_TEST = re.compile(r" \([^()]*\)$")
 _NUMBER = re.compile(r"-?\d+(\.\d+)?")
-_COMPARED = 1000  # names that differ, in search of two that resemble each other
+_MAX_COMPARED = 1000  # differing names among which two similar ones are searched for
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,9 +38,9 @@ class DetectionSummary:
     reasons : dict of int
         Rows per reason, most frequent first.
     details : dict of str
-        The commonest detail of a reason, for reasons that have any.
+        The most frequent detail of each reason that has any.
     likely_cause : str or None
-        Why nothing was measured, if a trial has shown it.
+        Why nothing was measured, if a trial showed it.
     frames_not_chosen : int
         Frames that match no wanted pattern.
     frames_without_time : int
@@ -63,12 +63,13 @@ class DetectionSummary:
     not_drawn : int
         Rings that are not in the contact sheet, since their frame could not be read again.
     guide_problem : str or None
-        Why reference poses and trajectory could not predict where to look again; None: they could.
+        Why reference poses and trajectory could not predict missing targets; None: they could.
     tone_base : str or None
-        The known curve that the frames' tone curve is near to; None: not learnt, or near neither.
+        The known curve to which the frames' tone curve is close; None: not learnt, or close to
+        none.
     measured_with_tone, overruled_by_tone, kept_other_tone : int
-        Measurements from which it was learnt; those that were changed by it; those that keep
-        another base because they are much likelier over that.
+        Numbers of measurements from which the base was learnt, of those that it changed, and of
+        those that keep another base because they fit it much better.
     stages_s : dict of float
         Time that each stage of the work took [s].
     """
@@ -98,7 +99,7 @@ class DetectionSummary:
 
     @property
     def problem(self) -> str | None:
-        """What is wrong with a run that has measured nothing, in one line with the remedy."""
+        """Why a run has measured nothing, in one line with the remedy; None if it has."""
         if self.status[Status.MEASURED.value]:
             return None
         text = f"no target was measured in any of {self.frames} frames"
@@ -109,12 +110,12 @@ class DetectionSummary:
         return f"{text}: {count} {reason}{detail}; {Reason.of(reason).remedy}"
 
     def numbers(self) -> dict[str, object]:
-        """Return all but the table, by name, for JSON."""
+        """Return all attributes but the table, by name, for JSON."""
         return {name: value for name, value in asdict(self).items() if name != "table"}
 
 
 class Stopwatch:
-    """How long the stages of the work take."""
+    """Measures the time of each stage."""
 
     def __init__(self) -> None:
         self.stages_s: dict[str, float] = defaultdict(float)  # by the stage's name
@@ -122,7 +123,7 @@ class Stopwatch:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Count the time of the block, however it ends."""
+        """Measure the time of a block, even if it raises."""
         start_s = time.perf_counter()
         try:
             yield
@@ -136,12 +137,12 @@ class Stopwatch:
 
 
 class SummaryBuilder:
-    """Counts of rows and frames, one frame after the other.
+    """Counts rows and frames, one frame after the other.
 
     Parameters
     ----------
     times : mapping of str to float
-        What the times file says, by frame.
+        Times in the times file, by frame.
     """
 
     def __init__(self, times: Mapping[str, float]) -> None:
@@ -152,7 +153,7 @@ class SummaryBuilder:
         self._status: Counter[Status] = Counter()
         self._reasons: Counter[Reason] = Counter()
         self._details: dict[Reason, Counter[str]] = defaultdict(Counter)
-        self._from_exif: Counter[bool] = Counter()  # by whether the time has no fraction
+        self._from_exif: Counter[bool] = Counter()  # by whether the time is a whole second
 
     def add(self, result: FrameResult) -> None:
         """Count a frame."""
@@ -175,7 +176,7 @@ class SummaryBuilder:
 
     def _count_detail(self, miss: Miss) -> None:
         counts, text = self._details[miss.reason], _without_place(miss.detail)
-        if text and (text in counts or len(counts) < _KEPT_DETAILS):
+        if text and (text in counts or len(counts) < _MAX_DETAILS):
             counts[text] += 1
 
     def summary(
@@ -191,7 +192,7 @@ class SummaryBuilder:
         learnt: LearntImaging | None,
         stages_s: Mapping[str, float],
     ) -> DetectionSummary:
-        """Return the counts, with what else there is to say."""
+        """Return the counts together with other results of the run."""
         unused = [name for name in self._times if name not in self._named]
         return DetectionSummary(
             table=table,
@@ -230,7 +231,7 @@ def _without_place(detail: str) -> str:
 
 
 def _commonest(details: Counter[str]) -> str:
-    """Return the commonest detail, of those that differ in their numbers alone."""
+    """Return the most frequent detail; those that differ only in numbers are counted together."""
     kinds: Counter[str] = Counter()
     for text, count in details.items():
         kinds[_NUMBER.sub("#", text)] += count
@@ -239,6 +240,6 @@ def _commonest(details: Counter[str]) -> str:
 
 
 def _name_difference(names: Sequence[str], frames: Sequence[str]) -> str | None:
-    """Tell how a name differs from that of a frame that it resembles."""
-    difference = likely_difference(names[:_COMPARED], frames[:_COMPARED])
+    """Describe how a name differs from the name of a similar frame; None if none is similar."""
+    difference = likely_difference(names[:_MAX_COMPARED], frames[:_MAX_COMPARED])
     return None if difference is None else "{!r} for {!r}: {}".format(*difference)

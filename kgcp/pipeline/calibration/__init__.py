@@ -1,1 +1,1 @@
-"""Photographs of a field of targets into a camera."""
+"""Calibration of a camera from photographs of a field of targets."""

@@ -25,7 +25,7 @@ _WORDS = ErrorWords(
 
 @dataclass(frozen=True, slots=True)
 class OtherCalibration:
-    """A camera, and the file that it is from."""
+    """A camera and the name of its file."""
 
     name: str
     camera: Camera

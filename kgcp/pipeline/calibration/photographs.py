@@ -1,4 +1,4 @@
-"""One photograph of a field: read, searched, measured, and measured again where discs must be."""
+"""Tasks for one photograph of a field: read, search and measure; measure missing discs later."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ class Photo:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SecondLook:
-    """A photograph that is to be searched where discs must be."""
+    """A photograph in which missing discs are searched for at predicted places."""
 
     photo: Photo
-    first: PhotoDiscs
-    predicted: FloatArray  # (k, 5): centroids and moments
-    point: FloatArray  # (k,): which of the field's discs they are
+    first: PhotoDiscs  # of the first pass
+    predicted: FloatArray  # (k, 5): predicted centroids and moments of the missing discs
+    point: FloatArray  # (k,): their indices in the field
 
 
 @single_threaded()
 def learn_from_photos(task: PhotoTask, count: int, photos: tuple[Photo, ...]) -> CameraTone | None:
-    """Learn what a camera does to all discs from the first photographs that can be read."""
+    """Learn the camera's tone curve and processing from the first `count` readable photographs."""
     return learn_from_fields(islice(_readable(photos), count), task)
 
 
@@ -61,7 +61,7 @@ def _readable(photos: Iterable[Photo]) -> Iterator[GreyArray]:
 
 @single_threaded()
 def measure_photo(task: PhotoTask, photo: Photo) -> PhotoDiscs | PhotoMiss:
-    """Find, name and measure a field; whatever a photograph can do wrong becomes its result."""
+    """Find, identify and measure the discs; errors of the photograph become its result."""
     try:
         grey = _read(photo.path)
     except Rejection as rejection:
@@ -74,7 +74,7 @@ def measure_photo(task: PhotoTask, photo: Photo) -> PhotoDiscs | PhotoMiss:
 
 @single_threaded()
 def measure_photo_again(task: PhotoTask, look: SecondLook) -> PhotoDiscs | PhotoMiss:
-    """Measure the discs of a photograph that the first pass has not found."""
+    """Measure the discs of a photograph that the first pass did not find."""
     try:
         grey = _read(look.photo.path)
     except Rejection as rejection:
@@ -93,5 +93,5 @@ def _read(path: Path) -> GreyArray:
     width, height = size
     if not 2 <= min(size) <= max(size) <= _LARGEST_PX:
         raise Rejection(Reason.DECODE_FAILED, f"{width} x {height} px")
-    focal = float(max(size))  # any: the reader compares sizes only
+    focal = float(max(size))  # arbitrary: the reader compares only sizes
     return read_grey(path, Camera(width, height, focal, focal, 0.5 * width, 0.5 * height))

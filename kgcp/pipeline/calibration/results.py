@@ -51,16 +51,16 @@ from kgcp.report.calibration.page import CalibrationPage, CameraComparison, rend
 
 CAMERA_FILE = "camera.toml"
 FIELD_FILES = ("field.toml", "field.csv")
-"""The field as stated, and as adjusted."""
+"""Files of the stated and of the adjusted field."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationResults:
-    """What was written, and what it says."""
+    """The files of a calibration and their content."""
 
     files: tuple[Path, ...]
-    left_out: dict[str, str]  # formats asked for, and why they cannot hold the camera
-    not_renewed: tuple[str, ...]  # formats of which an earlier run has left files
+    left_out: dict[str, str]  # requested formats that cannot hold the camera: format → reason
+    not_renewed: tuple[str, ...]  # formats with outdated files of an earlier run
     numbers: CalibrationNumbers
     verdict: CalibrationVerdict
     photos: tuple[PhotoRow, ...]
@@ -68,9 +68,9 @@ class CalibrationResults:
 
 
 def require_formats(formats: Sequence[str], settings: CalibrationSettings) -> None:
-    """Refuse formats that cannot hold the model asked for, before anything is measured.
+    """Refuse formats that cannot hold the requested model, before anything is measured.
 
-    Whether fx and fy are two, if that was left open, only the photographs say.
+    If it is open whether fx and fy differ, this cannot be checked before.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def require_formats(formats: Sequence[str], settings: CalibrationSettings) -> No
 
 
 def light_of(made: PhotoCalibration) -> DiscLight:
-    """Return what light does to the levels of the discs of all photographs that took part."""
+    """Return the effects of light on the levels of the discs in all photographs that took part."""
     return light_on_discs(
         (discs.vectors[:, :2], discs.appearance[:, :2], discs.appearance[:, 3])
         for discs in made.discs.values()
@@ -101,20 +101,20 @@ def write_results(
 ) -> CalibrationResults:
     """Write all files of a calibration into a folder.
 
-    A format with one focal length is left out if the camera has two: a camera that was made to have
-    one would fit worse, for all other files as well.
+    If the camera has two focal lengths, formats with a single one are left out. Forcing the camera
+    to have one would make it fit worse in all other files.
 
     Parameters
     ----------
     other : OtherCalibration, optional
-        To compare with.
+        A calibration to compare with.
     formats : sequence of str
-        Of `kgcp.io.formats.camera_writers.CAMERA_FORMATS`.
+        Some of `kgcp.io.formats.camera_writers.CAMERA_FORMATS`.
 
     Raises
     ------
     KgcpError
-        If a format cannot hold the lens's model, or a file cannot be written.
+        If a format cannot hold the lens model, or a file cannot be written.
     """
     calibration = made.calibration
     numbers = calibration_numbers(calibration, light_of(made))
@@ -156,7 +156,7 @@ def write_results(
 
 
 def _left_out(camera: Camera, formats: Sequence[str]) -> dict[str, str]:
-    """Return the formats that have no place for the camera's second focal length, and why."""
+    """Return the formats that cannot hold the camera's second focal length, with the reason."""
     difference_px = abs(camera.fx - camera.fy)
     why = f"fx and fy differ by {difference_px:.2g} px, and the format holds one focal length"
     return {form: why for form in formats if form in ONE_FOCAL_LENGTH and difference_px > 0.0}

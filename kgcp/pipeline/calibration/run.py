@@ -1,4 +1,4 @@
-"""Photographs of a field of targets into a camera: `kgcp calibrate`."""
+"""Calibration of a camera from photographs of a field: the use case behind `kgcp calibrate`."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from kgcp.targets.fields.naming import NamingProblem
 from kgcp.targets.fields.points import AnyField
 
 _LOSSES = {TaskFailure.CRASHED: Reason.WORKER_DIED, TaskFailure.TIMED_OUT: Reason.TIMED_OUT}
-LEARNED_FROM = 5  # photographs; they show what the camera does to grey values
+LEARNED_FROM = 5  # photographs from which the camera's tone curve and processing are learned
 _DIGITS = re.compile(r"(\d+)")
 
 OTHER_SIZE = "other_size"
@@ -93,22 +93,22 @@ _Item = TypeVar("_Item", Photo, SecondLook)
 
 @dataclass(frozen=True, slots=True)
 class CalibrationOptions:
-    """How photographs are worked on.
+    """Options of a calibration.
 
     Attributes
     ----------
     settings : CalibrationSettings
-        What is estimated.
+        The unknowns.
     response : Response
-        How grey values follow light.
+        Response of the camera.
     operator : Operator
-        How discs are measured.
+        Method of measuring discs.
     jobs : int or None
-        Worker processes; 0 works in this one; None: as many as there are cores.
+        Number of worker processes; 0: this process; None: the number of cores.
     photo_timeout_s : float
-        Time for one look at one photograph [s].
+        Time limit for one look at one photograph [s].
     is_restart : bool
-        Whether to begin anew, whatever an interrupted run has left.
+        Whether to start over instead of resuming an interrupted run.
     """
 
     settings: CalibrationSettings
@@ -121,7 +121,7 @@ class CalibrationOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotoCalibration:
-    """A calibrated camera, and what became of every photograph."""
+    """A calibrated camera, with the result of every photograph."""
 
     field: AnyField
     options: CalibrationOptions
@@ -157,7 +157,7 @@ def find_photos(places: Sequence[Path]) -> list[Photo]:
 
 
 def _in_reading_order(name: str) -> list[tuple[int, str]]:
-    """Return what sorts 2.png before 10.png."""
+    """Return a sort key that puts 2.png before 10.png."""
     parts = _DIGITS.split(name)
     return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
 
@@ -169,7 +169,7 @@ def calibrate_photos(
     options: CalibrationOptions,
     listener: ProgressListener,
 ) -> PhotoCalibration:
-    """Calibrate the camera that took photographs of a field, where nothing is written of it.
+    """Calibrate the camera that took photographs of a field, without writing results.
 
     Raises
     ------
@@ -190,8 +190,8 @@ def calibrated_photos(
 ) -> Iterator[PhotoCalibration]:
     """Calibrate the camera that took photographs of a field, for a block that writes the results.
 
-    However the work or the block is interrupted, what was measured is kept in a journal in `out`,
-    and the same call goes on from there. The journal is deleted once the block has ended.
+    Measurements are kept in a journal in `out`. If the work or the block is interrupted, the same
+    call resumes. The journal is deleted at the end of the block.
 
     Raises
     ------
@@ -242,9 +242,9 @@ def _calibrated(
 
 
 def _camera_of(pool: WorkerPool, task: PhotoTask, photos: Sequence[Photo]) -> CameraTone | None:
-    """Learn from some photographs what the camera does to all discs; None: each for itself."""
+    """Learn the camera's tone curve and processing; None: every photograph learns its own."""
     step = max(len(photos) // LEARNED_FROM, 1)
-    # from the whole set; where one cannot be read, the next one takes its place
+    # evenly from the whole set; photographs that cannot be read are replaced by the next ones
     ordered = tuple(photo for first in range(step) for photo in photos[first::step])
     with closing(pool.map(partial(learn_from_photos, task, LEARNED_FROM), [ordered])) as outcomes:
         ((_, learned),) = outcomes
@@ -269,10 +269,10 @@ def _camera_of(pool: WorkerPool, task: PhotoTask, photos: Sequence[Photo]) -> Ca
 
 
 class _Looks:
-    """Work on photographs by a pool, with results that a journal keeps.
+    """Looks at photographs by a pool of workers, with a journal of the results.
 
-    What was measured with another tone is measured anew: photographs may have been added or taken
-    away since.
+    Discs that were measured with another tone curve are measured anew. It may have changed because
+    photographs were added or removed.
     """
 
     def __init__(
@@ -326,7 +326,7 @@ def _stamp(item: Photo | SecondLook) -> tuple[int, int] | None:
 
 
 def _of_one_camera(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[PhotoDiscs | PhotoMiss]:
-    """Return the results with photographs of another size than the commonest left out.
+    """Return the results; photographs without the most frequent size become misses.
 
     Raises
     ------
@@ -364,7 +364,7 @@ def _of_one_camera(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[PhotoDiscs
 def _without_duplicates(
     results: Sequence[PhotoDiscs | PhotoMiss],
 ) -> list[PhotoDiscs | PhotoMiss]:
-    """Return the results, all but the first of those with the very same discs left out."""
+    """Return the results; of photographs with identical discs, all but the first become misses."""
     first_of: dict[bytes, str] = {}
     kept: list[PhotoDiscs | PhotoMiss] = []
     for result in results:
@@ -397,7 +397,7 @@ def _views(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[NamedView]:
 
 
 def _about_misses(results: Sequence[PhotoDiscs | PhotoMiss]) -> str:
-    """Return which photographs are left out and why, the commonest reason first, and remedies."""
+    """Return numbers of photographs left out by reason, most frequent first, and remedies."""
     misses: dict[str, list[PhotoMiss]] = {}
     for result in results:
         if isinstance(result, PhotoMiss):
@@ -425,7 +425,7 @@ def _second_pass(
     results: Sequence[PhotoDiscs | PhotoMiss],
     start: CameraCalibration,
 ) -> list[PhotoDiscs | PhotoMiss]:
-    """Look for the discs that the first pass has not found, where they must be."""
+    """Search for discs that the first pass did not find, at their predicted places."""
     places = {photo.name: photo for photo in photos}
     by_name = {result.photo: result for result in results}
     second = []
@@ -437,7 +437,7 @@ def _second_pass(
         names = [look.photo.name for look in second]
         function = partial(measure_photo_again, task)
         for result in looks.through("second pass", second, names, function):
-            if isinstance(result, PhotoDiscs):  # a loss leaves what the first pass has found
+            if isinstance(result, PhotoDiscs):  # after a failure, keep the result of the first pass
                 by_name[result.photo] = result
     return [by_name[result.photo] for result in results]
 

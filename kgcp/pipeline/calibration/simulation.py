@@ -24,7 +24,7 @@ from kgcp.simulation.presets import SimulationSettings, preset
 from kgcp.targets.fields.points import AnyField
 
 PHOTOGRAPHS = 14
-"""Of a session, unless something else is said."""
+"""Default number of photographs."""
 
 _POINT_COLUMNS = ("name", "x", "y", "z")
 _TRUTH_COLUMNS = (
@@ -36,23 +36,23 @@ _TRUTH_COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class FieldSimulation:
-    """A session to be rendered.
+    """Photographs of a field to be rendered.
 
     Attributes
     ----------
     field : Field or PointField
-        As it is meant to be; every disc is printed off by `flat_sd_m`, at random.
+        As stated; the printed discs deviate at random by `flat_sd_m`.
     settings : SimulationSettings
-        Camera, exposure, blur and what the camera does to grey values are those of a flight;
-        `frames` photographs are taken. Its distances and tilts are not used.
+        Camera, exposure, blur and image processing, as for a flight; `frames` is the number of
+        photographs. Distances and tilts are not used.
     seed : int
         The same seed gives the same photographs.
 
     Raises
     ------
     KgcpError
-        On making one, for light that only plates of a flight can have, rows that are exposed one
-        after the other, and motion of the image meanwhile that is not the preset's.
+        On construction, for uneven light, which only plates of a flight can have, a rolling
+        shutter, and motion of the image other than the preset's.
     """
 
     field: AnyField
@@ -61,14 +61,14 @@ class FieldSimulation:
 
     def __post_init__(self) -> None:
         settings = self.settings
-        unlike = {
+        unsupported = {
             "shadows": settings.shadow is not None,
             "dirt": settings.dirt is not None,
             "glare": settings.glare is not None,
             "a rolling shutter": settings.camera.readout_s > 0.0,
             "motion of the image": settings.motion != preset(settings.name).motion,
         }
-        for name, is_wanted in unlike.items():
+        for name, is_wanted in unsupported.items():
             if is_wanted:
                 raise KgcpError(
                     f"{settings.name}: photographs of a field are simulated without {name}; leave"
@@ -83,11 +83,11 @@ class FieldSimulation:
         return tuple(f"photo_{number:04d}.{suffix}" for number in range(self.settings.frames))
 
     def points_m(self) -> FloatArray:
-        """Return where the discs really are (m, 3), in the field's frame [m]."""
+        """Return the true positions (m, 3) of the discs, in the field's frame [m]."""
         return printed_points(FieldSession(self.settings.camera, self.field), self._stream("print"))
 
     def session(self, number: int) -> FieldSession:
-        """Return how one photograph is taken: exposure and blur are drawn anew for each."""
+        """Return the settings of one photograph; exposure and blur are random."""
         settings, rng = self.settings, self._stream("exposure", number)
         low, high = np.log(settings.gain).tolist()
         turn, streak_px = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(*settings.streak_px)
@@ -127,9 +127,9 @@ def write_field_photographs(
     Parameters
     ----------
     out : Path
-        The folder to be; it must not exist, or be empty.
+        The new folder; it must not exist, or be empty.
     jobs : int
-        Worker processes; 1 works in this one. The files do not depend on it.
+        Number of worker processes; 1: this process. The files do not depend on it.
     on_photograph : callable
         Called after each photograph.
 
@@ -174,7 +174,7 @@ def _truth_rows(simulation: FieldSimulation, poses: Sequence[Pose]) -> Iterator[
             session.gain,
             session.optics.psf_px,
         )
-        # Nine decimals: a nanometre, and the same on every processor.
+        # nine decimals, a nanometre: the same on every processor
         yield (photo, *(f"{round(value, 9) + 0.0:.9f}" for value in values))
 
 

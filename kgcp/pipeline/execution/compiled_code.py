@@ -1,9 +1,9 @@
 """The compiled code of the measurement, loaded or compiled before the first frame.
 
-A process takes half a second to load it. Under Linux, the server of new processes does so once,
-while the program loads what else it needs, and its children have it from the start. What is not
-compiled yet takes a minute: one worker compiles the search while another one compiles the
-adjustment, and all load what these leave on the disk (`kgcp.pipeline.execution.local_processes`).
+Loading it takes half a second per process. Under Linux, the server of new processes loads it once,
+while the program loads what else it needs, and all workers inherit it. Compiling takes a minute:
+one worker compiles the search while another one compiles the adjustment, and all others load the
+result from the disk (`kgcp.pipeline.execution.local_processes`).
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Ring, Target
 
 _SIDE_PX, _RADIUS_PX = 100, 20.0
-_FINE = 4  # points per pixel and axis
+_OVERSAMPLING = 4  # points per pixel and axis
 _BLACK, _WHITE, _NOISE = 40.0, 200.0, 1.5  # grey values
-_TILT_RAD, _BLUR_PX = 0.1, 0.5  # that an adjustment may start from
+_TILT_RAD, _BLUR_PX = 0.1, 0.5  # start values of the adjustment
 _CAMERA = Camera(_SIDE_PX, _SIDE_PX, 1000.0, 1000.0, 49.5, 49.5)
 _RING = Ring("A", 1.0, 0.5, 0.75, 0.15, (0.0, 80.0, 130.0, 250.0))
 
-_RESPONSES = (Response.LINEAR, Response.UNKNOWN)  # between them, they use most compiled functions
+_RESPONSES = (Response.LINEAR, Response.UNKNOWN)  # together they use most compiled functions
 
 _loaded: set[Response] = set()
 
@@ -43,20 +43,20 @@ class _NotCompiled(Exception):  # noqa: N818 - a state and no error
 
 
 def load_compiled_code() -> bool:
-    """Load what most frames need, and tell whether all of it is there; nothing is compiled."""
+    """Load the code that most frames need, without compiling; tell whether all of it exists."""
     if _loaded.issuperset(_RESPONSES):
         return True
     from numba.core import event
 
     class RefusedCandidate(event.Listener):
-        """Hears of functions that would be compiled."""
+        """Listener that prevents the compilation of functions."""
 
         def on_start(self, event: object) -> None:  # noqa: ARG002 - the base class's signature
-            """Refuse to compile one."""
+            """Refuse to compile a function."""
             raise _NotCompiled
 
         def on_end(self, event: object) -> None:
-            """Hear that it is compiled."""
+            """Do nothing after a compilation."""
 
     try:
         with event.install_listener("numba:compile", RefusedCandidate()):
@@ -68,7 +68,7 @@ def load_compiled_code() -> bool:
 
 @single_threaded()
 def compile_search() -> None:
-    """Compile what is missing of the search: by looking for the drawn plate."""
+    """Compile missing code of the search, by searching for a drawn plate."""
     grey, target = _drawn_plate(), Target(_RING)
     candidates = find_dotted_rings(grey, find_rings(grey, DetectSettings()), [_RING])
     (match,), _ = find_code(candidates[_RING], _RING, DetectSettings())
@@ -78,7 +78,7 @@ def compile_search() -> None:
 
 @single_threaded()
 def compile_adjustment() -> None:
-    """Compile what is missing of the adjustment: by measuring the drawn plate where it is."""
+    """Compile missing code of the adjustment, by measuring a drawn plate at its known place."""
     grey, distance_m = _drawn_plate(), _CAMERA.fx * 0.5 * _RING.outer_diameter_m / _RADIUS_PX
     pose = Pose(np.eye(3), np.array([0.0, 0.0, distance_m])).tilted(_TILT_RAD)
     start = InitialPose(_RING.name, 1.0, pose, _RADIUS_PX, edge_shift_px=0.0, blur_px=_BLUR_PX)
@@ -88,7 +88,7 @@ def compile_adjustment() -> None:
 
 @single_threaded()
 def compile_code() -> None:
-    """Load what most frames need, and compile what is missing: by measuring a drawn plate."""
+    """Load the code that most frames need and compile what is missing, by measuring a plate."""
     grey = _drawn_plate()
     for response in _RESPONSES:
         if response not in _loaded:
@@ -98,20 +98,20 @@ def compile_code() -> None:
 
 
 def compilation() -> Preparation:
-    """Return what new processes do before their first frame."""
+    """Return the preparation of new processes for their first frame."""
     return Preparation(load_compiled_code, compile_code, (compile_adjustment, compile_search))
 
 
 def _drawn_plate() -> GreyArray:
-    """Draw a plate seen from the front."""
-    places = (np.arange(_FINE * _SIDE_PX) + 0.5) / _FINE - 0.5
+    """Draw a plate that is seen frontally."""
+    places = (np.arange(_OVERSAMPLING * _SIDE_PX) + 0.5) / _OVERSAMPLING - 0.5
     x, y = np.meshgrid(places - _CAMERA.cx, places - _CAMERA.cy)
     px_per_m = _RADIUS_PX / (0.5 * _RING.outer_diameter_m)
     diameter = 2.0 * np.hypot(x, y) / px_per_m
     is_black = (diameter < _RING.outer_diameter_m) & (diameter > _RING.inner_diameter_m)
     for dot_x, dot_y in px_per_m * _RING.dot_centres_m():
         is_black &= 2.0 * np.hypot(x - dot_x, y - dot_y) / px_per_m > _RING.dot_diameter_m
-    share = is_black.reshape(_SIDE_PX, _FINE, _SIDE_PX, _FINE).mean(axis=(1, 3))
+    share = is_black.reshape(_SIDE_PX, _OVERSAMPLING, _SIDE_PX, _OVERSAMPLING).mean(axis=(1, 3))
     light = _WHITE + (_BLACK - _WHITE) * share
     light += np.random.default_rng(1).normal(0.0, _NOISE, light.shape)
     return np.asarray(light, dtype=np.uint8)

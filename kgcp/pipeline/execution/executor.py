@@ -31,13 +31,13 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True, slots=True)
 class WorkerPool:
-    """Workers, the same for all that a run does."""
+    """The workers of a run."""
 
-    jobs: int  # how many there are; 0: this process
+    jobs: int  # number of workers; 0: this process
     executor: Executor
-    # whose callees are the stages to be timed; empty: nothing is timed
+    # functions whose callees are timed as stages; empty: nothing is timed
     callers: tuple[Callable[..., object], ...]
-    stages_s: Counter[str]  # takes the time of all workers by stage [s]
+    stages_s: Counter[str]  # sums of the workers' times by stage [s]
 
     def import_meanwhile(self, *modules: str) -> None:
         """Import what this process needs later, while the workers work on the first frames."""
@@ -48,7 +48,7 @@ class WorkerPool:
     def map(
         self, function: Callable[[_Item], _Result], items: Iterable[_Item]
     ) -> Generator[tuple[_Item, _Result | TaskFailure]]:
-        """Yield items and results as they come."""
+        """Yield items and results in the order in which they are completed."""
         if not self.callers:
             yield from resilient_map(function, items, self.executor, self.jobs)
             return
@@ -79,15 +79,15 @@ def open_pool(
     jobs : int or None
         0: this process; None: the usable cores, or all threads that the scheduler has.
     limit_s : float
-        Time for one call [s]; no limit in this process.
+        Time limit for one call [s]; there is none in this process.
     scheduler : str or None
         As `kgcp.pipeline.execution.dask_client.connected` takes it; None: this machine works alone.
     frames : Path or StoredFolder
-        Where they are; other machines must see a folder under the same, absolute, name.
+        Place of the frames; other machines must see a folder under the same absolute path.
     callers : tuple of callable
-        To time what they call; see `profiled`.
+        Functions whose callees are timed; see `profiled`.
     preparation : Preparation, optional
-        Of each process of this machine.
+        Preparation of each process of this machine.
 
     Raises
     ------

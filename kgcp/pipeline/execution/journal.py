@@ -1,14 +1,14 @@
-"""Results of a run so far, kept beside its output until the output is there.
+"""The journal of a run: its results so far, kept beside the output until the output is complete.
 
-A journal is a file of lines: a checksum, a key, and the result of one frame. The key says all that
-the result depends on: a result is found again if, and only if, all of it is the same. The first
-line says by what all results were made. A line is appended when its result is there, so that
-whatever ends the run leaves at most one broken line, which counts as not done.
+A journal is a file of lines: a checksum, a key, and the result of one frame. The key covers
+everything that the result depends on, so that a result is found again if and only if all of it is
+unchanged. The first line states what all results depend on. Each line is appended as soon as its
+result exists. Whatever ends the run leaves at most one broken line, which is ignored.
 
-Records are written as text without the loss of a bit. Not by pickling: a journal lies in a folder
-that may come from anywhere, and a pickle may run code. Nor in a database: SQLite takes no less code
-once it must not trust the file (schemas with triggers, endless trees, rollback journals that name
-files to delete), and has no checksums.
+Records are written as text without loss of precision. They are not pickled, because a journal is
+in a folder that may come from anywhere, and a pickle may run code. A database would not help:
+SQLite has no checksums, and needs as much code if it must not trust the file (schemas with
+triggers, endless trees, rollback journals that name files to delete).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from kgcp.measurement import records
 from kgcp.measurement.discs.photograph import PhotoDiscs, PhotoMiss
 from kgcp.measurement.records import Considered, FrameResult, Imaging, Miss, TimeSource, ToneBase
 
-# All records that a result may consist of; `records` also imports those of other modules.
+# All record types of which a result may consist; `records` also imports those of other modules.
 _RECORDS: dict[str, type] = {
     name: record
     for name, record in vars(records).items()
@@ -51,15 +51,18 @@ _TIME_SOURCES: dict[str, TimeSource] = {source.value: source for source in TimeS
 Result = TypeVar("Result")
 
 _MADE_BY = "made-by"  # the key of the first line
-_SHORTEST_S = 1.0  # between two waits for the disk: what a power failure may cost
-_PAUSES = 100  # times as long as the last wait took, at least: 1 % of the time
-_LONGEST_LINE = 1 << 26  # bytes: what is longer is not a result
+# Shortest interval between two flushes to the disk: a power failure costs at most this time.
+_MIN_FLUSH_INTERVAL_S = 1.0
+# The interval is also at least this multiple of the last flush's duration, so that flushing takes
+# at most 1 % of the time.
+_FLUSH_INTERVAL_RATIO = 100
+_MAX_LINE_BYTES = 1 << 26  # longer lines are no results
 
 
 def to_text(value: object) -> str:
     """Return records, arrays, tuples, mappings and plain values as one line of JSON.
 
-    Floating-point numbers have as many digits as tell them from all others.
+    Floating-point numbers have as many digits as needed to restore them exactly.
     """
     return _ENCODER.encode(value)
 
@@ -70,7 +73,7 @@ def from_text(text: str | bytes, kinds: tuple[type[Result], ...]) -> Result:
     Raises
     ------
     ValueError
-        If it is anything else.
+        If the text is anything else.
     """
     try:
         result = json.loads(text, object_hook=_record)
@@ -82,7 +85,7 @@ def from_text(text: str | bytes, kinds: tuple[type[Result], ...]) -> Result:
 
 
 def fingerprint(*values: object) -> str:
-    """Return 32 hexadecimal digits that tell such values from all others."""
+    """Return 32 hexadecimal digits that identify these values."""
     return hashlib.sha256(to_text(values).encode()).hexdigest()[:32]
 
 
@@ -156,9 +159,9 @@ class Journal(Generic[Result]):
     ) -> None:
         self._path = path
         self._kinds = kinds
-        self._due_s = time.monotonic() + _SHORTEST_S
+        self._due_s = time.monotonic() + _MIN_FLUSH_INTERVAL_S
         self.seconds = 0.0  # spent here, for the run's record
-        # inputs that have changed since the journal was written, which was emptied therefore
+        # inputs that have changed since the journal was written, so that it was emptied
         self.changes: tuple[str, ...] = ()
         self._is_left = False
         self._writer = _locked(path)
@@ -170,7 +173,7 @@ class Journal(Generic[Result]):
                 if made_by and not is_new:
                     self.changes = tuple(key for key in making if made_by.get(key) != making[key])
                 self._writer.truncate(0)
-                self._reader.seek(0, os.SEEK_END)  # it forgets what was there
+                self._reader.seek(0, os.SEEK_END)  # discards the reader's buffer
                 self._offsets.clear()
                 self._append(_MADE_BY, json.dumps(dict(making)))
 
@@ -186,13 +189,15 @@ class Journal(Generic[Result]):
         try:
             self.flush()
         except KgcpError:
-            if kind is None or not issubclass(kind, KgcpError):  # of which this is the echo
+            if kind is None or not issubclass(kind, KgcpError):  # probably the same error again
                 raise
         finally:
             self._reader.close()
             self._writer.close()
             if self._is_left:
-                with suppress(PermissionError):  # the next run finds all results, and deletes it
+                with suppress(
+                    PermissionError
+                ):  # the next run finds all results and deletes the file
                     self._path.unlink(missing_ok=True)
 
     def __iter__(self) -> Iterator[str]:
@@ -208,36 +213,44 @@ class Journal(Generic[Result]):
         return None
 
     def read(self, key: str) -> Result:
-        """Return the result of a key that was there."""
+        """Return the result of a key that exists.
+
+        Raises
+        ------
+        KgcpError
+            If it cannot be read.
+        """
         result = self.get(key)
         if result is None:
             raise KgcpError(f"{self._path}: is damaged; start over", option="restart")
         return result
 
     def add(self, key: str, result: Result) -> None:
-        """Keep a result: at once for other processes, and on the disk within a second or so."""
+        """Add a result: visible to other processes at once, on the disk after about a second."""
         with self._access():
             self._append(key, to_text(result))
         if time.monotonic() >= self._due_s:
             self.flush()
 
     def flush(self) -> None:
-        """Wait until the disk has all results."""
+        """Wait until all results are on the disk."""
         began_s = time.monotonic()
         with self._access():
             os.fsync(self._writer.fileno())
         ended_s = time.monotonic()
-        self._due_s = ended_s + max(_SHORTEST_S, _PAUSES * (ended_s - began_s))
+        self._due_s = ended_s + max(
+            _MIN_FLUSH_INTERVAL_S, _FLUSH_INTERVAL_RATIO * (ended_s - began_s)
+        )
 
     def remove(self) -> None:
-        """Delete it: the output is there."""
+        """Delete the journal, because the output is complete."""
         with self._access():
             try:
-                self._path.unlink()  # before the lock on it goes
+                self._path.unlink()  # before its lock is released
             except PermissionError:
                 if os.name != "nt":
                     raise
-                self._is_left = True  # Windows keeps what is open
+                self._is_left = True  # Windows does not delete open files
 
     def _append(self, key: str, text: str) -> None:
         body = f"{key} {text}\n".encode()
@@ -248,17 +261,17 @@ class Journal(Generic[Result]):
 
     def _body(self, key: str) -> bytes:
         self._reader.seek(self._offsets[key])
-        return self._reader.readline(_LONGEST_LINE).split(b" ", 2)[2]
+        return self._reader.readline(_MAX_LINE_BYTES).split(b" ", 2)[2]
 
     def _find_lines(self) -> dict[str, int]:
-        """Index the whole lines; what else is there counts as not done."""
+        """Index the valid lines; ignore everything else."""
         offsets: dict[str, int] = {}
         offset = 0
-        while line := self._reader.readline(_LONGEST_LINE):
+        while line := self._reader.readline(_MAX_LINE_BYTES):
             checksum, _, body = line.partition(b" ")
             if checksum == b"%08x" % zlib.crc32(body):
                 offsets[body.partition(b" ")[0].decode(errors="replace")] = offset
-            elif not line.endswith(b"\n"):  # a next line would be part of it
+            elif not line.endswith(b"\n"):  # the next line would be appended to it
                 self._writer.truncate(offset)
                 break
             offset += len(line)
@@ -272,7 +285,7 @@ class Journal(Generic[Result]):
 
     @contextmanager
     def _access(self) -> Iterator[None]:
-        """Count the time of the block, and make lines of its errors."""
+        """Measure the time of a block, and convert its errors to `KgcpError`."""
         began_s = time.monotonic()
         try:
             yield
@@ -286,9 +299,9 @@ class Journal(Generic[Result]):
 
 
 def _locked(path: Path) -> FileIO:
-    """Open a file for writing, made if need be, that no other process has.
+    """Open a file for writing, created if needed, that no other process has open.
 
-    The lock is the kernel's: it ends with the process that holds it, however that ends.
+    The kernel holds the lock, and releases it when the process ends in whatever way.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -301,7 +314,7 @@ def _locked(path: Path) -> FileIO:
                 if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
                     raise OSError(errno.EINVAL, "is not a file; delete it")
                 lock(file.fileno())
-                # Whoever had it may have deleted it between the two steps of opening and locking.
+                # another process may have deleted the file between opening and locking
                 if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
                     stack.pop_all()
                     return file

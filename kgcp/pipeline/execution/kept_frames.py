@@ -1,7 +1,7 @@
-"""Decoded frames kept on the disk between two looks at them, as far as there is room.
+"""Decoded frames kept on the disk for a second look, as far as there is room.
 
-Decoding is most of what a second look costs. To read grey values back takes a tenth of it or less,
-and whatever process looks again finds them, while the memory of the workers stays as it is.
+Decoding takes most of the time of a second look; reading grey values back takes a tenth of that or
+less. On the disk, all processes find them, and the memory of the workers does not grow.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ import numpy as np
 from kgcp.geometry.arrays import GreyArray
 from kgcp.io.files.portable import replace
 
-_MOST_BYTES = 1 << 31  # a thousand frames of 2 Mpx
-_SHARE_OF_DISK = 0.25  # of what is free
-_COUNT = "count"  # a file with a byte for each frame: to list the folder takes ever longer
+_MAX_BYTES = 1 << 31  # a thousand frames of 2 Mpx
+_MAX_DISK_SHARE = 0.25  # of the free space
+# A file with one byte per frame, to count them. Listing the folder would take longer and longer.
+_COUNT = "count"
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,18 +30,19 @@ class KeptFrames:
     """A folder of decoded frames."""
 
     folder: Path
-    most_bytes: int  # all frames of a flight are of one size
+    max_bytes: int  # limit for all frames, which have one size in a flight
 
     def keep(self, frame: str, grey: GreyArray) -> None:
-        """Keep the grey values of a frame if there is room; a full disk gets back what was kept."""
+        """Keep the grey values of a frame if there is room; if the disk is full, delete all."""
         path = self._path(frame)
-        unfinished = path.with_suffix(f".{os.getpid()}")  # whatever ends this process: not the name
+        # written under another name: if this process is killed, no broken frame is found
+        unfinished = path.with_suffix(f".{os.getpid()}")
         try:
-            with (self.folder / _COUNT).open("ab") as count:  # for all processes
+            with (self.folder / _COUNT).open("ab") as count:  # shared by all processes
                 count.write(b".")
                 count.flush()
                 number = count.tell()
-            if number * grey.nbytes <= self.most_bytes:
+            if number * grey.nbytes <= self.max_bytes:
                 with unfinished.open("wb") as stream:
                     np.lib.format.write_array(stream, grey, allow_pickle=False)
                 replace(unfinished, path)
@@ -60,21 +62,21 @@ class KeptFrames:
 
 
 def remove_kept_frames(folder: Path) -> None:
-    """Remove the folder, of this run or of one that was killed."""
+    """Remove the folder of this run, or of one that was killed."""
     shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager
 def kept_frames(folder: Path) -> Iterator[KeptFrames | None]:
-    """Have a folder for decoded frames until the block ends; None if it cannot be made.
+    """Provide a folder for decoded frames until the block ends; None if it cannot be created.
 
-    What a run that was killed has left there goes first: its frames may have changed since.
+    Frames left by a run that was killed are removed first, since they may have changed.
     """
     remove_kept_frames(folder)
     try:
         folder.mkdir()
-        room = int(_SHARE_OF_DISK * shutil.disk_usage(folder).free)
-        kept = KeptFrames(folder.absolute(), min(_MOST_BYTES, room))
+        room = int(_MAX_DISK_SHARE * shutil.disk_usage(folder).free)
+        kept = KeptFrames(folder.absolute(), min(_MAX_BYTES, room))
     except OSError:
         kept = None
     try:

@@ -1,4 +1,4 @@
-"""Time of one call by the stages that it strings together."""
+"""The time of one call, divided among its stages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 OTHER = "other steps"
-"""What a call does between its stages."""
+"""Name of the time between stages."""
 
 _PACKAGE = PurePath(__file__).parents[2]
 
@@ -23,20 +23,20 @@ _PACKAGE = PurePath(__file__).parents[2]
 def profiled(
     callers: tuple[Callable[..., object], ...], function: Callable[[_Item], _Result], item: _Item
 ) -> tuple[_Result, Mapping[str, float]]:
-    """Call a function and measure its stages, at the price of some time.
+    """Call a function and measure the time of its stages, which slows it down.
 
     Parameters
     ----------
     callers : tuple of callable
-        Functions that only string stages together, as do all others of their modules: what these
-        modules call elsewhere in the package are the stages.
+        Functions in modules that only call stages one after the other. Stages are the functions
+        that these modules call elsewhere in the package.
 
     Returns
     -------
     result
         As the function's.
     stages_s : mapping of str to float
-        Seconds of each stage, by its name. Together they are the time of the call.
+        Time of each stage, by its name [s]. The sum is the time of the call.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Work on many items in spite of processes that die or hang: only the guilty item is lost."""
+"""A map over many items that survives processes that die or hang: only their item is lost."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from kgcp.pipeline.execution.signals import defer_interrupts
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_LONGEST_WAIT_S = 0.5  # during which Windows hears no Ctrl-C, before Python 3.13
+_MAX_WAIT_S = 0.5  # before Python 3.13, Windows does not react to Ctrl-C during a wait
 
 
 def usable_cores() -> int:
@@ -27,8 +27,8 @@ def usable_cores() -> int:
 class TaskFailure(Enum):
     """Why an item has no result."""
 
-    CRASHED = auto()  # the process that worked on it ended
-    TIMED_OUT = auto()  # it took longer than it may
+    CRASHED = auto()  # its process ended
+    TIMED_OUT = auto()  # it exceeded the time limit
 
 
 class Lost(Exception):  # noqa: N818 - the outcome of one item, of which the map makes a value
@@ -40,7 +40,7 @@ class Lost(Exception):  # noqa: N818 - the outcome of one item, of which the map
 
 
 class SerialExecutor(Executor):
-    """Works in this process, at once: its end is the end of all. Signals wait for a call's end."""
+    """Makes calls immediately in this process, without protection. Signals wait for their end."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:  # noqa: ANN401 - the base class's signature
         """Return the result of a call as a future that is done."""
@@ -56,19 +56,19 @@ class SerialExecutor(Executor):
 def resilient_map(
     function: Callable[[Item], Result], items: Iterable[Item], executor: Executor, jobs: int
 ) -> Generator[tuple[Item, Result | TaskFailure]]:
-    """Yield every item with `function(item)`, as they come; few are in memory at a time.
+    """Yield every item with `function(item)` as they are completed; few are in memory at a time.
 
-    An item that is lost is tried once more when all others are done: alone, since memory may have
-    run out because of what others needed at the same time. If it is lost again, it stays lost.
+    A lost item is tried once more after all others, and alone: memory may have run out because of
+    other items. If it is lost again, it stays lost.
 
     Parameters
     ----------
     function : callable
-        Importable, or a partial of what is.
+        An importable function, or a partial of one.
     executor : Executor
-        One whose calls raise `Lost` when their process ends. It stays open.
+        Its calls raise `Lost` when their process ends. It stays open.
     jobs : int
-        Calls that it makes at a time.
+        Number of calls that the executor makes at a time.
 
     Raises
     ------
@@ -78,8 +78,8 @@ def resilient_map(
     remaining = iter(items)
     pending: dict[Future[Result], Item] = {}
     suspects: list[Item] = []
-    # Unlike `concurrent.futures.wait`, this queue's `get` may be left by a signal's exception: it
-    # is written in C, and leaves no lock behind for which another thread would wait for ever.
+    # A signal's exception may interrupt this queue's `get`, unlike `concurrent.futures.wait`. The
+    # queue is written in C, and leaves no lock behind on which another thread would wait for ever.
     done: SimpleQueue[Future[Result]] = SimpleQueue()
 
     def submit(item: Item) -> None:
@@ -107,7 +107,7 @@ def resilient_map(
 
 
 def _next(done: SimpleQueue[Future[Result]]) -> Future[Result]:
-    """Return the call that ends next; a signal's exception may end the wait."""
+    """Return the next call that ends; a signal's exception may interrupt the wait."""
     while True:
         with suppress(Empty):
-            return done.get(timeout=_LONGEST_WAIT_S)
+            return done.get(timeout=_MAX_WAIT_S)

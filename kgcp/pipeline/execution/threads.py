@@ -1,9 +1,9 @@
-"""One thread per process in the numeric libraries: the same bytes, and no waiting for each other.
+"""One thread per process in the numeric libraries, so that results do not depend on their number.
 
-A sum that several threads share is added up in another order than one thread adds it. So the last
-bits of a matrix product depend on the number of threads, and with them, now and then, a digit of a
-result. Everything that kgcp computes is therefore computed by one thread; processes are its
-parallelism.
+Several threads add up a sum in another order than a single one. So the last bits of a matrix
+product depend on the number of threads, and occasionally a digit of a result. Therefore each
+process of kgcp computes with one thread; kgcp uses several processes instead. They also do not
+compete for cores.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ _THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS
 
 
 def use_one_thread_each() -> None:
-    """Keep numeric libraries from starting threads: here if not loaded yet, and in new processes.
+    """Limit numeric libraries to one thread: those not yet loaded here, and in new processes.
 
-    It overrides what the environment says, because results would depend on that.
+    This overrides the environment, because results would depend on it.
     """
     for variable in _THREAD_VARIABLES:
         os.environ[variable] = "1"
@@ -34,9 +34,9 @@ def use_one_thread_each() -> None:
 def single_threaded() -> Iterator[None]:
     """Keep BLAS, LAPACK and OpenCV on one thread until the block ends, then restore their threads.
 
-    It also holds in a program that has loaded the libraries before it calls kgcp, and for calls
-    from several threads, the last of which restores. As a decorator, `@single_threaded()`, it
-    serves a function; a generator it would not.
+    It also works in programs that have loaded the libraries before they call kgcp. Several threads
+    may call it; the last one restores. The decorator `@single_threaded()` works for functions, but
+    not for generators.
     """
     _LIMIT.enter()
     try:
@@ -46,7 +46,7 @@ def single_threaded() -> Iterator[None]:
 
 
 class _Limit:
-    """The limit of a process, which has one number of threads for all blocks that are at work."""
+    """The limit of this process, shared by all blocks that are running."""
 
     def __init__(self) -> None:
         self._lock = Lock()
@@ -54,7 +54,7 @@ class _Limit:
         self._undo = ExitStack()
 
     def enter(self) -> None:
-        """Limit the libraries, unless another block has done so."""
+        """Limit the libraries, unless another running block has done so."""
         import cv2
 
         with self._lock:
@@ -67,7 +67,7 @@ class _Limit:
             self._blocks += 1
 
     def leave(self) -> None:
-        """Restore the libraries, unless another block is still at work."""
+        """Restore the libraries, unless another block is still running."""
         with self._lock:
             self._blocks -= 1
             if self._blocks == 0:
