@@ -89,17 +89,17 @@ class FlightBias:
     Attributes
     ----------
     settings : DetectSettings
-        That the distances were measured with.
+        Settings with which the distances were measured.
     study : BiasStudy
         Every comparison.
     provenance : mapping of str
-        What the comparisons were made from: the metadata of their table.
+        Origin of the comparisons: the metadata of their table.
     doubts : tuple of Doubt
-        What does not fit, with its likely cause, grave doubts first.
+        Doubts with their likely causes, grave ones first.
     outcomes : Outcomes or None
-        What became of the frames; None: not known.
+        Outcomes of the frames; None: unknown.
     consistency : Consistency or None
-        How well vehicle and camera agree; None: too few frames to compare.
+        Agreement of vehicle and camera; None: too few frames to compare.
     learnt : LearntImaging or None
         What the frames say together of the camera; None: nothing was learnt.
     """

@@ -1,4 +1,4 @@
-"""A dry run: what a flight's folder holds, what follows from it, and what does not fit."""
+"""A dry run: the content of a flight's folder, what follows from it, and the doubts about it."""
 
 from __future__ import annotations
 
@@ -28,27 +28,28 @@ from kgcp.settings import DetectSettings
 from kgcp.simulation.outlook import least_plain_px
 from kgcp.targets.plain import PlainTarget
 
-_TYPICAL_M = 50.0  # a distance to name, where no reference tells any
-_UNEVEN = 10.0  # times the median, from which the largest standard deviation is named
+_TYPICAL_M = 50.0  # distance to report if there is no reference
+# The largest standard deviation is reported if it is larger than the median by this factor.
+_UNEVEN_RATIO = 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class FlightCheck:
-    """What a dry run has found."""
+    """The result of a dry run."""
 
     name: str  # of the flight
-    facts: Mapping[str, str]  # what there is, and what follows from it, by its heading
-    doubts: tuple[Doubt, ...]  # what does not fit, grave doubts first
+    facts: Mapping[str, str]  # heading → content of the folder and what follows from it
+    doubts: tuple[Doubt, ...]  # grave doubts first
 
     @property
     def is_grave(self) -> bool:
-        """Whether results would be worthless if a doubt is right."""
+        """Whether there is a doubt that, if justified, makes results worthless."""
         return any(doubt.is_grave for doubt in self.doubts)
 
 
 @single_threaded()
 def check_flight(flight: Flight, *, stored_frames: StoredFolder | None = None) -> FlightCheck:
-    """Read everything but the pixels of a flight, and report what does not fit.
+    """Read everything but the pixels of a flight, and report doubts.
 
     Parameters
     ----------
@@ -197,7 +198,7 @@ def _sds_text(sd_position_m: FloatArray | None) -> str:
         return ", no standard deviations"
     usual_cm, worst_cm = 100.0 * np.median(sd_position_m, axis=0), 100.0 * sd_position_m.max()
     text = f", σ {'/'.join(map(rounded, usual_cm.tolist()))} cm"
-    is_uneven = worst_cm > _UNEVEN * usual_cm.max()  # as while GNSS is out
+    is_uneven = worst_cm > _UNEVEN_RATIO * usual_cm.max()  # as while GNSS is out
     return f"{text}, at worst {rounded(worst_cm)} cm" if is_uneven else text
 
 

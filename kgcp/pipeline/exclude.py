@@ -1,4 +1,4 @@
-"""Which points of which flight a list of unwanted frames means."""
+"""Points to exclude from each flight, by a list of unwanted frames."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kgcp.io.tables.detections import read_detections
 FrameAndTarget = tuple[str, str]
 """Frame and target."""
 
-_SHOWN = 3  # names in a message
+_MAX_SHOWN = 3  # names in a message
 
 
 def rows_of(table: Path) -> set[FrameAndTarget]:
@@ -31,19 +31,19 @@ def rows_of(table: Path) -> set[FrameAndTarget]:
 def excluded_rows(
     exclusions: Iterable[Exclusion], rows: Mapping[str, set[FrameAndTarget]]
 ) -> dict[str, tuple[FrameAndTarget, ...]]:
-    """Return for each flight what `Selection.excluded` is to be.
+    """Return `Selection.excluded` for each flight.
 
-    Lines that mean nothing are told in a `KgcpWarning`: a slip would leave a bad point in.
+    Lines that match nothing cause a `KgcpWarning`, because a typing error would keep a bad point.
 
     Parameters
     ----------
     rows : mapping
-        Of the flights' detections, by the flights' names.
+        Rows of the flights' detections, by the flights' names.
 
     Raises
     ------
     KgcpError
-        For a line that names no flight, but a frame that several have.
+        If a line names no flight, and several flights have its frame.
     """
     chosen: dict[str, list[FrameAndTarget]] = {name: [] for name in rows}
     unknown = []
@@ -74,8 +74,8 @@ def _is_known(exclusion: Exclusion, rows: set[FrameAndTarget]) -> bool:
 
 def _warn_of_unknown(unknown: Sequence[Exclusion]) -> None:
     if unknown:
-        shown = "; ".join(map(str, unknown[:_SHOWN]))
-        more = f" and {len(unknown) - _SHOWN} more" if len(unknown) > _SHOWN else ""
+        shown = "; ".join(map(str, unknown[:_MAX_SHOWN]))
+        more = f" and {len(unknown) - _MAX_SHOWN} more" if len(unknown) > _MAX_SHOWN else ""
         warnings.warn(
             f"{len(unknown)} lines of the list of frames to leave out name no row of the"
             f" detections ({shown}{more}); write frames as paths below the frames folder",

@@ -1,4 +1,4 @@
-"""Ground control points: from a flight and its detections to points, and from these to files."""
+"""Ground control points: computed from a flight and its detections, and written to files."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ class GcpSet:
     Attributes
     ----------
     flight : Flight
-        Whose points they are.
+        The flight of the points.
     crs : str
-        Of all coordinates.
+        CRS of all coordinates.
     gcps : tuple of Gcp
     skipped : tuple of SkippedSighting
         Sightings that made no point, or a point that was not selected.
@@ -139,12 +139,12 @@ def make_gcps(
 def _sightings(
     table: Path, attempts: Sequence[Attempt], selection: Selection
 ) -> tuple[Sequence[Sighting], Sequence[SkippedSighting]]:
-    """Return the sightings that points are made of, and those that are excluded.
+    """Return the sightings for points, and those that are excluded.
 
     Raises
     ------
     KgcpError
-        If there is none of the former.
+        If there are no sightings for points.
     """
     measured = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
     if not measured:
@@ -159,7 +159,7 @@ def _sightings(
 
 
 def accuracy_text(gcps: Sequence[Gcp]) -> str:
-    """Return how well points are known, in words; nothing where no deviations are known."""
+    """Return the accuracy of points in words; empty if no standard deviations are known."""
     variances = [np.diag(point.cov_m2) for point in gcps if point.cov_m2 is not None]
     if not variances:
         return ""

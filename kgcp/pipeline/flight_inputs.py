@@ -1,4 +1,4 @@
-"""Everything that a flight's folder says before anything is measured, and the doubts about it."""
+"""The inputs in a flight's folder before anything is measured, and the doubts about them."""
 
 from __future__ import annotations
 
@@ -64,12 +64,12 @@ _Input = TypeVar("_Input")
 
 @contextmanager
 def naming_causes(doubts: Sequence[Doubt]) -> Iterator[None]:
-    """Let an error about places or times name its cause, if a grave doubt explains it.
+    """Replace an error about places or times by its cause, if a grave doubt explains it.
 
     Raises
     ------
     KgcpError
-        That of the block, or the doubt in its place.
+        The error of the block, or the doubt in its place.
     """
     try:
         yield
@@ -82,7 +82,7 @@ def naming_causes(doubts: Sequence[Doubt]) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class FlightInputs:
-    """The records of a flight, each read when it is first needed, or why it cannot be."""
+    """The records of a flight, read when first needed; errors are kept as doubts."""
 
     flight: Flight
     data: FlightData
@@ -106,11 +106,11 @@ class FlightInputs:
         Parameters
         ----------
         folder : StoredFolder, optional
-            Where the frames are, if not in the flight's folder.
+            Place of the frames, if they are not in the flight's folder.
         max_headers : int, optional
-            How many headers to read; by default all.
+            Largest number of headers to read; by default all.
         headers_of : sequence of str, optional
-            The frames whose headers count; by default all.
+            Frames whose headers are read; by default all.
         """
         return cls(
             flight,
@@ -250,16 +250,16 @@ class FlightInputs:
         return ranked(doubts)
 
     def doubts(self) -> tuple[Doubt, ...]:
-        """Return what does not fit or cannot be read, grave doubts first."""
+        """Return all doubts and reading errors, grave ones first."""
         doubts = self.plausibility
         if _has_wrong_places(doubts):
-            return doubts  # what cannot be read then is the consequence
+            return doubts  # reading errors are then a consequence
         return ranked((*self.problems, *doubts))
 
     def compared(
         self, sightings: Sequence[Sighting]
     ) -> tuple[Consistency | None, tuple[Doubt, ...]]:
-        """Return how well vehicle and camera agree, None: not known, and all doubts, ranked."""
+        """Return the agreement of vehicle and camera (None: unknown), and all doubts, ranked."""
         data, camera = self.data, self.flight.camera
         positions = data.target_positions
         poses = data.reference_poses if data.has_reference else None

@@ -1,4 +1,4 @@
-"""A flight.toml for a folder that has none: what lies there, what it says, and what is missing."""
+"""Draft of a flight.toml for a folder without one, with what is found there and what is missing."""
 
 from __future__ import annotations
 
@@ -56,13 +56,13 @@ _EXAMPLE_TARGET = (
 
 @dataclass(frozen=True, slots=True)
 class FlightDraft:
-    """A flight.toml that is not yet written, and the reasons for it."""
+    """A flight.toml that is not yet written, with its reasons."""
 
     toml_text: str
-    # times of the frames, where their names have them; None: another file has, or none
+    # times of the frames if their names have them; None: they are in another file, or unknown
     frames_csv: str | None
-    findings: tuple[InitFinding, ...]  # what the folder tells, and where it stands
-    gaps: tuple[Gap, ...]  # what it does not tell, and what to do about it
+    findings: tuple[InitFinding, ...]  # what was found in the folder, and where
+    gaps: tuple[Gap, ...]  # what is missing, and what to do about it
 
 
 def draft_flight(folder: Path, options: InitOptions = _NO_OPTIONS) -> FlightDraft:
@@ -140,7 +140,7 @@ def _of_frames(contents: FolderContents) -> Iterator[Part]:
 
 @dataclass(frozen=True, slots=True)
 class _Times:
-    """Where the frames' times come from."""
+    """Times of the frames and their source."""
 
     time_s: Mapping[str, float]  # Unix UTC [s]
     parts: tuple[Part, ...]

@@ -15,13 +15,16 @@ from kgcp.pipeline.init_records import Gap, InitFinding, Section
 from kgcp.quality.checks.frame_header import FrameHeader
 
 _SMALL_FRAME_MM = math.hypot(36.0, 24.0)  # its diagonal, to which CIPA's equivalents refer
-_WIDE, _FULL_SHAPE = 1.7, 0.75
+# Frames with a larger aspect ratio than the first are cropped from sensors with the second ratio of
+# height to width.
+_WIDE_ASPECT, _FULL_SHAPE = 1.7, 0.75
 _PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _DIGITS = 9
-# Of a focal length by EXIF: equivalents are whole millimetres, lenses a few per cent off their
-# name. Of an unknown lens' centre and distortion: what consumer cameras have.
+# Standard deviations of a guess. Focal length by EXIF: equivalents are whole millimetres, and real
+# lenses differ from their nominal focal length by a few per cent. Principal point and distortion of
+# an unknown lens: typical values of consumer cameras.
 _SD_FOCAL, _SD_CENTRE, _SD_K1 = 0.03, 0.01, 0.1
-_SD_FACTORY = 0.001  # of a focal length; docs/calibrations.md
+_SD_FACTORY = 0.001  # of a focal length by the manufacturer; see docs/calibrations.md
 _REMEDY = (
     "put a calibration file into the folder before kgcp init, or write its values, or file = …,"
     " into [camera]"
@@ -153,13 +156,13 @@ def _guessed_px(header: FrameHeader) -> tuple[FrameHeader, float, str] | None:
 
 
 def _full_diagonal_px(width: int, height: int) -> float:
-    """Return the diagonal of the sensor, to which equivalents refer.
+    """Return the diagonal of the sensor, to which equivalent focal lengths refer.
 
-    Frames of 16:9 are cut out of sensors of 4:3: with its own diagonal, the focal length of
-    Phantom 3's camera (20 mm, 4000 x 2250 px) would be 8 % too short.
+    Frames of 16:9 are cropped from sensors of 4:3. With the diagonal of the frame itself, the focal
+    length of the Phantom 3's camera (20 mm, 4000 x 2250 px) would be 8 % too short.
     """
     long, short = max(width, height), min(width, height)
-    return math.hypot(long, _FULL_SHAPE * long if long > _WIDE * short else short)
+    return math.hypot(long, _FULL_SHAPE * long if long > _WIDE_ASPECT * short else short)
 
 
 def _no_camera(size: tuple[int, int] | None, why: str) -> Section:

@@ -1,4 +1,4 @@
-"""What `kgcp init` has found in a folder, what is missing, and what that makes of flight.toml."""
+"""Records of `kgcp init`: what it found in a folder, what is missing, parts of flight.toml."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kgcp.io.flight.toml_draft import DraftKey, DraftTable, DraftText
 
 @dataclass(frozen=True, slots=True)
 class InitFinding:
-    """One thing that the folder tells, and where it stands."""
+    """One piece of information in the folder, and where it was found."""
 
     heading: str
     text: str
@@ -19,12 +19,12 @@ class InitFinding:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """One thing that the folder does not tell, and what to do about it."""
+    """One missing piece of information, and what to do about it."""
 
     heading: str
     text: str
     remedy: str
-    is_assumed: bool = False  # flight.toml has a value for it, which nothing confirms
+    is_assumed: bool = False  # whether flight.toml gets a value that nothing confirms
 
 
 Part = DraftKey | InitFinding | Gap
@@ -53,7 +53,7 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class InitOptions:
-    """What the user says, beside what lies in the folder; None or empty: nothing."""
+    """What the user states in addition to the files in the folder; None or empty: nothing."""
 
     targets_file: Path | None = None  # a flight.toml, or the targets.toml of `kgcp target`
     # directions of the dots of targets, separated by commas [deg]; they need `diameter_m`

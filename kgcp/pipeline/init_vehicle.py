@@ -1,4 +1,4 @@
-"""The vehicle of a folder: its trajectory, by whose clock and in which CRS that is."""
+"""The vehicle of a folder: its trajectory, with the time system and CRS."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One frame in memory, measured: the way in for programs that have their own images."""
+"""Measurement of one frame in memory: the entry point for programs with their own images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Points of several flights as one set, for one block."""
+"""Points of several flights merged into one set for one block."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ from kgcp.simulation.flight import (
 
 Result = TypeVar("Result")
 
-_PNG_COMPRESSION = 3  # noise does not compress: more effort costs time and saves nothing
+_PNG_COMPRESSION = 3  # noise does not compress: higher levels take longer and save nothing
 _EXPOSURE_AT_GAIN_1_S = Fraction(1, 1250)
 _ISO = 100
 _F_NUMBER = Fraction(28, 5)
@@ -158,7 +158,7 @@ def write_simulated_flight(
 
 @contextmanager
 def new_folder(out: Path) -> Iterator[Path]:
-    """Give a folder to write into, which becomes `out` once everything is written.
+    """Provide a temporary folder that becomes `out` once everything is written.
 
     Raises
     ------
@@ -192,7 +192,7 @@ def render_all(
     jobs: int,
     on_frame: Callable[[], object],
 ) -> list[Result]:
-    """Return what rendering frames 0 … count - 1 gives, in `jobs` processes.
+    """Return the results of rendering frames 0 … count - 1 in `jobs` processes.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Where a command works: in the flight's folder, or beside an object store that has it."""
+"""Working folders of a command: the flight's own, or copies if it is in an object store."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from kgcp.io.images.frames import FRAME_SUFFIXES, RESULTS_NAME
 from kgcp.io.images.remote import StoredFolder
 
 DETECTIONS = "detections.parquet"
-"""What `kgcp detect` makes, and the other commands need."""
+"""File name of the detections, which `kgcp detect` writes and other commands read."""
 
 
 def results_folder(flight: Path) -> Path:
-    """Return the results' folder of a flight for which no other is named.
+    """Return the default folder of a flight's results.
 
-    A flight's folder may come from anybody. A link in the place of its results, or of a folder
-    among them, would have files written wherever it leads.
+    A flight's folder may come from anybody. If the results' folder or a folder in it is a link,
+    files would be written wherever it leads. Such links are refused.
 
     Raises
     ------
@@ -50,11 +50,11 @@ def results_folder(flight: Path) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Workspace:
-    """Folders of this machine, and what they stand for."""
+    """Folders of this machine, and the places in a store that they replace."""
 
-    flight: Path  # has flight.toml and what that names, but for the frames of a stored flight
-    out: Path  # takes the results
-    # what `flight` and `out` stand for; None: they are what the user named
+    flight: Path  # with flight.toml and the files that it names, without frames of a stored flight
+    out: Path  # for the results
+    # places in a store that `flight` and `out` replace; None: they are the user's own folders
     stored_flight: StoredFolder | None
     stored_out: StoredFolder | None
 
@@ -93,7 +93,7 @@ class Workspace:
 def open_workspace(
     flight: Path | StoredFolder, out: Path | StoredFolder | None, needs: Sequence[str] = ()
 ) -> Iterator[Workspace]:
-    """Have a place to work at until the block ends, and put the results where they belong.
+    """Provide working folders until the block ends, and then store the results.
 
     Parameters
     ----------

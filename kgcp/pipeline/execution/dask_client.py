@@ -1,4 +1,4 @@
-"""A Dask cluster as workers: the frames of one flight, looked at by many machines.
+"""A Dask cluster as workers: many machines examine the frames of one flight.
 
 Dask sends frames' names out and results back, and gives the work of a machine that is gone to
 others. `kgcp.pipeline.execution.dask_worker` is the part that runs there.
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 _LOCAL = re.compile(r"local:([1-9]\d{0,2})")
 _CONNECT_S = 5.0  # for the scheduler to answer
-_WORKERS_S = 120.0  # without any worker, after which the run fails
-_WATCH_S = 2.0  # between two looks whether there are workers
+_WORKERS_S = 120.0  # time without any worker after which the run fails
+_WATCH_S = 2.0  # between two checks whether there are workers
 
 
 class DaskCluster(Executor):

@@ -1,4 +1,4 @@
-"""What the server of new processes loads before it starts any: this import leaves it ready."""
+"""Module that the server of new processes imports first: it loads everything that workers need."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import kgcp.io.images.exif as exif_files
 import kgcp.pipeline.execution.compiled_code as code
 
 exif_files.load_formats()
-with contextlib.suppress(Exception):  # what fails here fails in a worker, which can tell of it
+with contextlib.suppress(Exception):  # an error here recurs in a worker, which can report it
     code.load_compiled_code()
 gc.freeze()  # what is loaded is shared with the workers, as long as nobody searches it for garbage
 atexit.register(gc.freeze)

@@ -1,4 +1,4 @@
-"""Signals that stop the program, held back where they would do harm."""
+"""Signals that stop the program, deferred where they would do harm."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _STOPS = (signal.SIGINT, signal.SIGTERM)
 
 
 def _block_interrupts() -> Callable[[], object]:
-    """Block SIGINT in this thread and in processes that it starts; return what undoes that.
+    """Block SIGINT in this thread and in processes that it starts; return a function to undo it.
 
     Windows has no masks: there a process that is started gets Ctrl-C, too, and ignores it itself.
     """
@@ -26,7 +26,7 @@ def _block_interrupts() -> Callable[[], object]:
 
 @contextmanager
 def defer_interrupts() -> Iterator[None]:
-    """Hold SIGINT and SIGTERM back while they would break something; they come when the block ends.
+    """Defer SIGINT and SIGTERM until the block ends.
 
     An exception that a signal's handler raises between two lines of an executor's code leaves a
     lock behind, for which another thread then waits for ever; raised while a compiled function

@@ -15,7 +15,7 @@ from kgcp.network.ground.resection import NoPoseError
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.ground.own_frame import OrientedFrame, require_a_pose, write_own_frame_poses
 
-_SD_FOCAL = 0.2  # relative, of a focal length that is only roughly known
+_SD_FOCAL = 0.2  # relative standard deviation of a focal length that is only roughly known
 
 
 @single_threaded()

@@ -27,7 +27,8 @@ from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.ground.own_frame import OrientedFrame, require_a_pose, write_own_frame_poses
 from kgcp.targets.fields.points import AnyField
 
-_RADIUS_SHARE = 0.03  # of the radii: prints and edges are better
+# Largest relative difference between measured and expected radii. Prints and edges are better.
+_MAX_RADIUS_DIFFERENCE = 0.03
 
 
 @single_threaded()
@@ -56,7 +57,7 @@ def orient_frames_by_field(
     task = PhotoTask(field, flight.camera.response, Operator.MODEL)
     some = chosen[:: max(len(chosen) // LEARNED_FROM, 1)][:LEARNED_FROM]
     task = replace(task, camera=learn_from_fields(_readable(flight, some), task))
-    with np.errstate(all="ignore"):  # poses are tried anywhere: what is not finite is no result
+    with np.errstate(all="ignore"):  # trial poses may be absurd; results that are not finite fail
         made = [_oriented(flight, task, frame, has_free_focal=has_free_focal) for frame in chosen]
     require_a_pose(made, flight, f"field {field.name!r}")
     return made
@@ -102,7 +103,7 @@ def field_doubts(frames: Sequence[OrientedFrame[FieldPose]], field: AnyField) ->
     """
     scales = [each.pose.radius_scale for each in frames if each.pose is not None]
     scale = float(np.median(scales))
-    if not field.is_diameter_stated or abs(scale - 1.0) <= _RADIUS_SHARE:
+    if not field.is_diameter_stated or abs(scale - 1.0) <= _MAX_RADIUS_DIFFERENCE:
         return ()
     times = f"{scale:.0f}" if scale > 100.0 else f"{scale:.3g}"
     doubt = (

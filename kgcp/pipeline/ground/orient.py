@@ -35,19 +35,19 @@ from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.number_text import rounded
 
-_SIGNIFICANT = 3.0  # standard deviations of what all distances are off by
+_SIGNIFICANT_SIGMAS = 3.0  # a larger common scale of the distances is reported
 
 
 @dataclass(frozen=True, slots=True)
 class OrientOptions:
-    """Which frames to orient, and how.
+    """Options of an orientation.
 
     Attributes
     ----------
     frames : tuple of str
-        Patterns of their names; empty: all.
+        Patterns of the names of frames to orient; empty: all.
     min_points : int
-        Targets that must agree where distances do not check a pose.
+        Number of targets that must agree if their distances do not check the pose.
     has_free_focal : bool
         Whether the focal length is unknown.
     """
@@ -65,12 +65,12 @@ class FlightPoses:
     ----------
     flight : Flight
     poses : tuple of FramePose
-        One per frame, in their order, in the ENU frame of `local_frame`.
+        One per frame, in the frames' order, in the ENU frame of `local_frame`.
     local_frame : LocalFrame
     provenance : mapping of str
         The metadata of the table.
     wrong_position : WrongPosition or None
-        That positions of targets contradict each other.
+        A target whose position contradicts the others; None: there is none.
     """
 
     flight: Flight
@@ -81,7 +81,7 @@ class FlightPoses:
 
     @property
     def oriented(self) -> tuple[FramePose, ...]:
-        """Those with a pose."""
+        """Frames with a pose."""
         return tuple(each for each in self.poses if each.pose is not None)
 
     @property
@@ -104,9 +104,9 @@ class FlightPoses:
 
     @property
     def distance_scale(self) -> tuple[float, float] | None:
-        """What all distances are too long by, alike, as a share, and its standard deviation.
+        """Relative amount by which all distances are too long, and its standard deviation.
 
-        The median of the frames. None: no frame tells.
+        Both are medians over the frames. None: no frame determines it.
         """
         pairs = [
             (each.distance_scale, each.sd_distance_scale)
@@ -120,7 +120,7 @@ class FlightPoses:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What to look at before the poses are used."""
+        """Warnings to consider before the poses are used."""
         doubts = []
         enough = [each for each in self.poses if len(each.targets) >= MIN_POINTS]
         oriented = sum(each.residuals is not None for each in enough)
@@ -141,7 +141,7 @@ class FlightPoses:
             )
         if self.distance_scale is not None:
             share, sd = self.distance_scale
-            if abs(share) > _SIGNIFICANT * sd:
+            if abs(share) > _SIGNIFICANT_SIGMAS * sd:
                 doubts.append(
                     f"the distances are {1000.0 * abs(share):.1f} ‰ (± {1000.0 * sd:.1f})"
                     f" {'longer' if share > 0.0 else 'shorter'} than the positions say; look at the"
@@ -205,7 +205,7 @@ def orient_flight(
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
     sd_scale = print_scale_sd(flight.all_targets)
     rotations = data.scene_rotations
-    with np.errstate(all="ignore"):  # poses are tried anywhere: what is not finite is no result
+    with np.errstate(all="ignore"):  # trial poses may be absurd; results that are not finite fail
         poses = orient_frames(
             frames,
             sightings,

@@ -1,4 +1,4 @@
-"""Frames oriented in the frame of what they show: an EO device, or a field of discs."""
+"""Frames oriented in the coordinate frame of an EO device or a field of discs in them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PoseT = TypeVar("PoseT", DevicePose, FieldPose)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OrientedFrame(Generic[PoseT]):
-    """What became of one frame: a pose, or why there is none."""
+    """The pose of one frame, or the reason why there is none."""
 
     frame: str
     pose: PoseT | None
@@ -27,7 +27,7 @@ class OrientedFrame(Generic[PoseT]):
 
 
 def require_a_pose(frames: Sequence[OrientedFrame[PoseT]], flight: Flight, shown: str) -> None:
-    """Refuse a flight of which no frame could be oriented by what is shown in it.
+    """Refuse a flight of which no frame could be oriented.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def write_own_frame_poses(
     path: Path,
     columns: Mapping[str, Callable[[PoseT], str]],
 ) -> Path:
-    """Write the poses as CSV, with columns that tell more of each; return the path.
+    """Write the poses as CSV with additional columns; return the path.
 
     Raises
     ------

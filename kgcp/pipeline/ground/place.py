@@ -51,26 +51,26 @@ from kgcp.report.places.page import PlacesPage, render_places
 from kgcp.targets.plain import AnyTarget
 
 EXPORTS = "places"
-"""Folder of the packages' files, below that of the results."""
+"""Folder of the files for other packages, in the folder of the results."""
 
 MIN_FRAMES = 3
-"""Least number of frames by default: two place a circle, a third checks it."""
+"""Default least number of frames: two place a circle, the third checks it."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceOptions:
-    """What is to be placed, and from what.
+    """Options of a placement.
 
     Attributes
     ----------
     targets : tuple of str
-        Names; empty: all that have a position in flight.toml.
+        Names of the targets to place; empty: all with a position in flight.toml.
     poses : Path or None
         File of the camera's poses; None: [reference] of flight.toml.
     min_frames : int
         Least number of frames that show a target.
     has_exact_poses : bool
-        Whether the standard deviations of the poses are disregarded.
+        Whether the standard deviations of the poses are ignored.
     """
 
     targets: tuple[str, ...] = ()
@@ -88,13 +88,13 @@ class FlightPlaces:
     flight : Flight
     placement : Placement
     sightings : tuple of Sighting
-        Those that took part.
+        Sightings that took part.
     local_frame : LocalFrame
-        Of the places.
+        Local frame of the places.
     provenance : mapping of str
         The metadata of the tables.
     motions : CameraMotions or None
-        Of the camera of a rolling shutter.
+        Motions of the camera if it has a rolling shutter.
     """
 
     flight: Flight
@@ -106,7 +106,7 @@ class FlightPlaces:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Diameters and places against flight.toml, in words."""
+        """Comparison of diameters and places with flight.toml, in words."""
         sentences = []
         for placed in self.placement.targets:
             sentences += [diameter_sentence(placed), position_sentence(placed)]
@@ -114,7 +114,7 @@ class FlightPlaces:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What to look at before the places are used."""
+        """Warnings to consider before the places are used."""
         doubts = [doubt for placed in self.placement.targets for doubt in doubts_of(placed)]
         of_all = (
             step_sentence(self.placement),
@@ -124,7 +124,7 @@ class FlightPlaces:
         return (*doubts, *(sentence for sentence in of_all if sentence))
 
     def gcps(self) -> tuple[Gcp, ...]:
-        """Return a ground control point for every sighting that took part, at the placed target."""
+        """Return a ground control point at the placed target for every sighting that took part."""
         positions = TargetPositions(
             self.local_frame,
             {placed.target: self._in_enu(placed) for placed in self.placement.targets},
@@ -179,7 +179,7 @@ def place_flight(
     local_frame = _local_frame(flight, poses)
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
     motions = motions_while_read(flight, data, poses, local_frame, attempts)
-    with np.errstate(all="ignore"):  # circles are tried anywhere: what is not finite is no result
+    with np.errstate(all="ignore"):  # trial circles may be absurd; what is not finite is rejected
         placement = place_targets(
             sightings,
             targets,
@@ -205,7 +205,7 @@ def place_flight(
 
 
 def _require_fit(placement: Placement, flight: Flight, poses: Path | None) -> None:
-    """Refuse a placement without targets, or by poses that are not those of the images."""
+    """Refuse a placement without targets, or with poses that do not belong to the images."""
     if not placement.targets:
         name, reason = next(iter(placement.skipped.items()))
         raise KgcpError(f"no target can be placed: {name!r} {reason}")
