@@ -1,13 +1,14 @@
-"""Exterior orientation of the camera from a moving plate, whose attitude the vehicle gives.
+"""Exterior orientation of the camera from the plate on a vehicle of known attitude.
 
-The pose of the plate in the camera and the attitude of the vehicle that carries it give the
-attitude of the camera; from the plate's place it is then one vector to the projection centre:
+The pose of the plate in the camera and the attitude of the vehicle give the attitude of the camera.
+The measured vector from the projection centre to the plate then gives the projection centre:
 
     R(map ← camera) = R(map ← body) R(body ← plate) R(camera ← plate)ᵀ
     X(camera)       = X(plate) − R(map ← camera) t
 
 R(body ← plate) is the mount of docs/conventions.md. A small error of the plate's normal moves the
-camera by the whole distance times that angle: these are priors, as weak as their covariances.
+camera by the distance times that angle. The results are therefore priors only, to be weighted by
+their covariances.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from kgcp.georef.target_positions import TargetPositions, Vehicle
 from kgcp.settings import VehicleSettings
 
 MIN_AMBIGUITY = 2.0 * math.log(100.0)
-"""Δχ² of the other pose from which on a pose counts as told apart: odds of 100 to 1."""
+"""Least Δχ² of the other pose at which a pose counts as unambiguous: odds of 100 to 1."""
 
 BODY_FROM_LEVEL_PLATE: FloatArray = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """Default mount: plate x = body y, plate y = −body x, plate z = body z, as columns."""
@@ -56,7 +57,7 @@ class CameraPrior:
     cov : (6, 6) array or None
         Position along the map's axes [m], then a small rotation about the map's axes, applied to
         `map_from_camera` from the left [rad]. Errors that all frames share (calibration, print)
-        are in it. None: the trajectory or the measurement has no deviations.
+        are included. None: trajectory or measurement have no standard deviations.
     """
 
     frame: str
@@ -74,7 +75,8 @@ def opk_deg(priors: Sequence[CameraPrior]) -> FloatArray:
 def opk_covs(priors: Sequence[CameraPrior]) -> list[FloatArray | None]:
     """Return the covariances (6, 6) of x, y, z [m], omega, phi, kappa [deg]; None: not known.
 
-    R = Rx(ω) Ry(φ) Rz(κ) turns about x, then the y that ω has turned, then the z that both have.
+    R = Rx(ω) Ry(φ) Rz(κ) rotates about x, then about y as turned by ω, then about z as turned by
+    both.
     """
     omega, phi, _ = np.radians(opk_deg(priors)).T
     zero, one = np.zeros_like(omega), np.ones_like(omega)
@@ -91,7 +93,7 @@ def opk_covs(priors: Sequence[CameraPrior]) -> list[FloatArray | None]:
 
 
 def body_from_plate(mount_deg: float) -> FloatArray:
-    """Return the plate's axes (3, 3) in body axes, as columns, for a turn from the default."""
+    """Return the plate's axes (3, 3) in body axes, as columns, turned from the default mount."""
     turn = rotation_about(np.array([0.0, 0.0, math.radians(mount_deg)]))
     return np.asarray(BODY_FROM_LEVEL_PLATE @ turn)
 
@@ -102,17 +104,18 @@ def camera_priors(
     target_positions: TargetPositions,
     local_frame: LocalFrame,
 ) -> tuple[CameraPrior, ...]:
-    """Orient the camera in every frame where the plate on the vehicle determines its attitude.
+    """Orient the camera in every frame in which the plate on the vehicle determines its attitude.
 
-    Left out are static targets, whose attitude is unknown, measurements without a pose, and
-    those whose two poses cannot be told apart: the wrong one moves the camera by metres.
+    Three kinds of sightings give no prior: static targets, because their attitude is unknown;
+    measurements without a pose; and ambiguous poses, because the wrong one moves the camera by
+    metres.
 
     Parameters
     ----------
     sightings : sequence of Sighting
-        Of which the KGCPs were made.
+        From which the KGCPs were made.
     target_positions : TargetPositions
-        Of the flight's targets; without a vehicle there is no prior.
+        Of the flight's targets. Without a vehicle there are no priors.
     local_frame : LocalFrame
         Of the KGCPs' coordinates.
     """
@@ -125,7 +128,7 @@ def camera_priors(
         for point in gcps
         if point.time_s is not None
         and point.target not in target_positions.static
-        and _is_told_apart(sighting_of[point.frame, point.target])
+        and _is_pose_unambiguous(sighting_of[point.frame, point.target])
     ]
     if not chosen:
         return ()
@@ -134,7 +137,7 @@ def camera_priors(
     return _oriented(pairs, times, vehicle, local_frame)
 
 
-def _is_told_apart(sighting: Sighting) -> bool:
+def _is_pose_unambiguous(sighting: Sighting) -> bool:
     is_clear = sighting.ambiguity is None or sighting.ambiguity >= MIN_AMBIGUITY
     return sighting.pose is not None and is_clear
 
@@ -145,11 +148,11 @@ def _oriented(
     vehicle: Vehicle,
     local_frame: LocalFrame,
 ) -> tuple[CameraPrior, ...]:
-    """Orient the camera in frames with a pose, at times (n,) by the trajectory's clock."""
+    """Orient the camera in frames with a pose at times (n,) by the trajectory's clock [s]."""
     states = vehicle.motion.states(time_s)
     level = vehicle.local_frame.level_rotations(states.position_m)
     plate = local_frame.enu_from_map(np.array([point.position_map for point, _ in pairs]))
-    # East, north and up are those of the plate, whatever datum the points' CRS has.
+    # East, north and up are those at the plate, so that the datum of the points' CRS has no effect.
     enu_from_frame = local_frame.level_rotations(plate) @ np.swapaxes(level, -1, -2)
     enu_from_body = enu_from_frame @ states.frame_from_body
     poses = [sighting.pose for _, sighting in pairs if sighting.pose is not None]
@@ -187,11 +190,12 @@ def _whole_pose_cov(sighting: Sighting) -> FloatArray | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Attitude:
-    """The vehicle's attitude at one time, in ENU, and how well it is known [deg]."""
+    """The vehicle's attitude at one time, with its uncertainty."""
 
-    enu_from_body: FloatArray
-    sd_deg: FloatArray
-    cov_turn_rad2: FloatArray  # (3, 3): of its interpolation, a small rotation about ENU axes
+    enu_from_body: FloatArray  # (3, 3): body axes in ENU, as columns
+    sd_deg: FloatArray  # (3,): of roll, pitch, heading
+    # (3, 3): covariance of the interpolation's error, a small rotation about ENU axes
+    cov_turn_rad2: FloatArray
     settings: VehicleSettings
 
 
@@ -204,29 +208,31 @@ def _cov(
 ) -> FloatArray:
     """Return the covariance (6, 6) of position [m] and left rotation [rad] in ENU, first order.
 
-    With r = R t (camera → plate, in ENU), errors α of the vehicle's attitude and μ of the mount, ρ
-    of the plate's place, and τ, δ of the pose (t + τ, exp(δ) R(camera ← plate)):
+    Let r = R t be the vector from camera to plate in ENU. The errors are α of the vehicle's
+    attitude, μ of the mount, ρ of the plate's position, and τ, δ of the pose
+    (t + τ, exp(δ) R(camera ← plate)). The errors of the result are
 
         rotation  α + μ − R δ
         position  ρ − (α + μ) × r − R (τ + t × δ)
 
-    ρ holds the attitude's effect on the lever arm, α × lever, from which it correlates with α.
+    ρ includes the attitude's effect on the lever arm, α × lever; it is therefore correlated with α.
     """
     body = vehicle.enu_from_body
     (turns,) = attitude_axes(body[None], np.array([[0.0, 0.0, -1.0]]))
     cov_attitude = covariance_along(turns, np.radians(vehicle.sd_deg)) + vehicle.cov_turn_rad2
-    # Nothing else is known of the mount; without a deviation it counts as exact, as does its turn.
+    # Only the mount's tilt has a standard deviation. Without one it counts as exact; its rotation
+    # about the plate's normal always does.
     tilt_sd = math.radians(vehicle.settings.level_sd_deg or 0.0)
     cov_mount = covariance_along(body[:, :2], np.full(2, tilt_sd))
     lever = body @ np.array(vehicle.settings.lever_arm_m)
-    arm = cross_matrix(enu_from_camera @ translation)
+    sight = cross_matrix(enu_from_camera @ translation)
     from_pose = np.block(
         [
             [-enu_from_camera, -enu_from_camera @ cross_matrix(translation)],
             [np.zeros((3, 3)), -enu_from_camera],
         ]
     )
-    from_turn = np.vstack((arm, np.eye(3)))
+    from_turn = np.vstack((sight, np.eye(3)))
     shared = np.zeros((6, 6))
     shared[:3] = -cross_matrix(lever) @ cov_attitude @ from_turn.T
     cov: FloatArray = from_pose @ cov_pose @ from_pose.T

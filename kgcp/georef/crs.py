@@ -1,4 +1,4 @@
-"""Coordinate reference systems: how they are read, and the best ways between them by PROJ."""
+"""Coordinate reference systems: reading them, and the best transformations between them by PROJ."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ CRS_KEY = "flight.toml: crs"
 VEHICLE_CRS = "flight.toml: [vehicle] crs"
 WGS84_3D = "EPSG:4979"
 """Longitude, latitude and ellipsoidal height of WGS 84."""
-FARTHEST = 1e5
-"""Metres or feet from the Earth's surface, beyond any vehicle or aircraft."""
+MAX_HEIGHT = 1e5
+"""Largest credible height [m or ft], beyond any vehicle or aircraft."""
 
 
 def crs_of(text: str) -> CRS:
-    """Return the CRS that a text names, without heights where it has none.
+    """Return the CRS that a text names; heights are not added.
 
     Raises
     ------
     CRSError
-        If pyproj cannot read it, or it names a file of definitions (`+init=`, which PROJ has given
-        up): it would be opened, whatever it is.
+        If pyproj cannot read it, or if it names a file of definitions by `+init=`. PROJ deprecates
+        this, and would open any file so named.
     """
     if "init=" in text:
         raise CRSError("'init=' is no longer in use; write EPSG:25832 for +init=epsg:25832")
@@ -39,18 +39,18 @@ def crs_of(text: str) -> CRS:
 
 
 def parse_crs(crs: str, where: str = CRS_KEY) -> CRS:
-    """Return a CRS with heights; ellipsoidal ones, in metres, unless it is compound.
+    """Return a CRS with heights: its own if it is compound, otherwise ellipsoidal ones in metres.
 
     Raises
     ------
     KgcpError
-        Beginning with `where`, if pyproj cannot read it.
+        If pyproj cannot read it. The message begins with `where`.
     """
     try:
         parsed = crs_of(crs)
     except ProjError as error:
         raise unusable(crs, error, where) from error
-    while parsed.is_bound and parsed.source_crs is not None:  # its way to WGS 84 is not needed
+    while parsed.is_bound and parsed.source_crs is not None:  # its shift to WGS 84 is not needed
         parsed = parsed.source_crs
     return parsed if parsed.is_compound else parsed.to_3d()
 
@@ -62,7 +62,7 @@ def unusable(crs: str, error: ProjError, where: str) -> KgcpError:
 
 
 def geographic_of(geocentric: CRS) -> str:
-    """Return the geographic CRS, with ellipsoidal heights, of a geocentric one's datum."""
+    """Return the geographic CRS with ellipsoidal heights that has a geocentric CRS's datum."""
     geographic = GeographicCRS(name=geocentric.name, datum=geocentric.datum)
     return str(geographic.to_3d().to_string())
 
@@ -75,14 +75,14 @@ def best_transformer(
 ) -> Transformer:
     """Return the best operation between two CRS; x is easting or longitude in both.
 
-    A second-best operation would be metres off and look the same, above all where the heights of
-    a geoid are taken as ellipsoidal: with ballpark operations allowed PROJ leaves heights
-    unchanged, silently, where a geoid grid is missing. `only_best` alone does not prevent it.
+    A second-best operation can be metres off without any sign of it. The worst case is a missing
+    geoid grid: if ballpark operations are allowed, PROJ silently leaves heights unchanged, so that
+    heights above the geoid are taken as ellipsoidal. `only_best` alone does not prevent this.
 
     Parameters
     ----------
     where, remedy : str
-        Beginning and end of messages: what leads from where to where, and what else to give.
+        Beginning and end of messages: which transformation it is, and what to give instead.
 
     Raises
     ------
@@ -107,35 +107,35 @@ def best_transformer(
 
 
 def convert_positions(file: str, position: FloatArray, source: str, target: str) -> FloatArray:
-    """Bring a trajectory's positions (n, 3), read from a file, from one CRS to another.
+    """Transform a trajectory's positions (n, 3), read from a file, from one CRS to another.
 
     Raises
     ------
     KgcpError
-        As `best_transformer`, or if a point is out of the operation's domain or far from the
-        Earth's surface.
+        As `best_transformer`, or if a point is outside the operation's domain or higher than
+        `MAX_HEIGHT`.
     """
     transformer = best_transformer(
         parse_crs(source, VEHICLE_CRS),
         parse_crs(target),
-        f"{file}: the way of its positions from {source!r} to the flight's crs {target!r}",
+        f"{file}: the transformation from {source!r} to the flight's crs {target!r}",
     )
     converted = np.column_stack(transformer.transform(*position.T))
     is_valid = np.isfinite(converted).all(axis=1)
     if not parse_crs(target).is_geocentric:
-        is_valid &= np.abs(converted[:, 2]) < FARTHEST
-    lost = np.flatnonzero(~is_valid)
-    if lost.size:
-        where = ", ".join(f"{value:.10g}" for value in position[lost[0]])
+        is_valid &= np.abs(converted[:, 2]) < MAX_HEIGHT
+    invalid = np.flatnonzero(~is_valid)
+    if invalid.size:
+        where = ", ".join(f"{value:.10g}" for value in position[invalid[0]])
         raise KgcpError(
-            f"{file}: the point ({where}) of epoch {lost[0] + 1} has no place in {target!r};"
-            f" correct the file, or [vehicle] crs in flight.toml, which is {source!r} now"
+            f"{file}: the point ({where}) of epoch {invalid[0] + 1} cannot be transformed to"
+            f" {target!r}; correct the file, or [vehicle] crs in flight.toml (now {source!r})"
         )
     return converted
 
 
 def wgs84_from_map(crs: str, positions: Sequence[FloatArray], where: str) -> FloatArray:
-    """Bring map points (n, 3) to longitude, latitude [deg] and ellipsoidal height [m] (n, 3).
+    """Return longitude, latitude [deg] and ellipsoidal height [m] (n, 3) of map points (n, 3).
 
     Raises
     ------
@@ -145,7 +145,7 @@ def wgs84_from_map(crs: str, positions: Sequence[FloatArray], where: str) -> Flo
     if not positions:
         return np.empty((0, 3))
     to_wgs84 = best_transformer(
-        parse_crs(crs), parse_crs(WGS84_3D), f"{where}: the way from {crs!r} to WGS 84"
+        parse_crs(crs), parse_crs(WGS84_3D), f"{where}: the transformation from {crs!r} to WGS 84"
     )
     x, y, z = np.array(positions).T
     return np.column_stack(to_wgs84.transform(x, y, z, errcheck=True))
@@ -155,8 +155,8 @@ def wgs84_from_map(crs: str, positions: Sequence[FloatArray], where: str) -> Flo
 class AreaOfUse:
     """Where a CRS is meant to be used."""
 
-    name: str  # of the region, as PROJ's database has it
-    # its bounds; west is larger than east where it holds the antimeridian
+    name: str  # of the region, from PROJ's database
+    # its bounds; west is larger than east if it crosses the antimeridian
     west_deg: float
     south_deg: float
     east_deg: float
@@ -164,16 +164,16 @@ class AreaOfUse:
 
     @property
     def is_world(self) -> bool:
-        """Whether it holds all longitudes, so that nothing lies outside."""
+        """Whether it covers all longitudes."""
         return self.east_deg - self.west_deg >= 360.0
 
     def degrees_outside(self, longitude_deg: float, latitude_deg: float) -> float:
-        """Return how far a place is from the area, along a parallel or a meridian [deg]."""
+        """Return how far a place is from the area, the larger of both coordinates [deg]."""
         width = (self.east_deg - self.west_deg) % 360.0 if not self.is_world else 360.0
         from_west = (longitude_deg - self.west_deg) % 360.0
-        beside = 0.0 if from_west <= width else min(from_west - width, 360.0 - from_west)
-        above = max(self.south_deg - latitude_deg, latitude_deg - self.north_deg, 0.0)
-        return max(beside, above)
+        off_longitude = 0.0 if from_west <= width else min(from_west - width, 360.0 - from_west)
+        off_latitude = max(self.south_deg - latitude_deg, latitude_deg - self.north_deg, 0.0)
+        return max(off_longitude, off_latitude)
 
 
 @lru_cache(maxsize=8)
@@ -207,9 +207,9 @@ def is_geographic(crs: str) -> bool:
 
 
 def longitude_latitude(crs: str, xy: FloatArray) -> FloatArray:
-    """Return longitude and latitude (n, 2) of map points (n, 2), of the CRS's datum [deg].
+    """Return longitude and latitude (n, 2) in the CRS's datum of map points (n, 2) [deg].
 
-    NaN where the map has no such point.
+    NaN for points outside the map's domain.
 
     Raises
     ------
@@ -228,11 +228,11 @@ def longitude_latitude(crs: str, xy: FloatArray) -> FloatArray:
 @lru_cache(maxsize=8)
 def _to_longitude_latitude(crs: str) -> Transformer | None:
     parsed = parse_crs(crs)
-    flat = parsed.sub_crs_list[0] if parsed.is_compound else parsed.to_2d()
-    geodetic = flat.geodetic_crs
+    horizontal = parsed.sub_crs_list[0] if parsed.is_compound else parsed.to_2d()
+    geodetic = horizontal.geodetic_crs
     if geodetic is None:
         return None
-    return Transformer.from_crs(flat, geodetic.to_2d(), always_xy=True)
+    return Transformer.from_crs(horizontal, geodetic.to_2d(), always_xy=True)
 
 
 @lru_cache(maxsize=8)

@@ -1,4 +1,4 @@
-"""Which CRS coordinates of unknown origin may be in, once it is known where they are."""
+"""Candidates for the unknown CRS of coordinates whose place is roughly known."""
 
 from __future__ import annotations
 
@@ -10,28 +10,30 @@ from pyproj.database import query_crs_info
 from pyproj.enums import PJType
 from pyproj.exceptions import ProjError
 
-_NEAR_M = 5000.0  # from the frames' own positions to the vehicle; other zones are farther off
-_USUAL = ("ETRS89", "WGS 84", "NAD83", "GDA2020", "JGD2011")  # datums of satellite positioning
+# Largest distance of the vehicle from the frames' own positions. In a wrong zone it is larger.
+_MAX_DISTANCE_M = 5000.0
+# datums of satellite positioning, preferred in this order
+_SATELLITE_DATUMS = ("ETRS89", "WGS 84", "NAD83", "GDA2020", "JGD2011")
 
 
 def utm_crs(longitude_deg: float, latitude_deg: float) -> str:
     """Return the UTM zone (WGS 84) of a place, for pyproj.
 
-    The exceptions for Norway and Svalbard are not made: any zone near by is right.
+    The special zones of Norway and Svalbard are ignored: any zone near by will do.
     """
     zone = math.floor((longitude_deg + 180.0) / 6.0) % 60 + 1
     return f"EPSG:{(32600 if latitude_deg >= 0.0 else 32700) + zone}"
 
 
 def is_geographic_place(x: float, y: float) -> bool:
-    """Return whether a map point can be longitude and latitude [deg]."""
+    """Tell whether a map point can be longitude and latitude [deg]."""
     return abs(x) <= 180.0 and abs(y) <= 90.0
 
 
 def projected_crs_near(
     x: float, y: float, longitude_deg: float, latitude_deg: float
 ) -> tuple[str, ...]:
-    """Return the projected CRS of EPSG in which a map point lies near a known place.
+    """Return the projected CRS of EPSG that put a map point near a known place.
 
     Parameters
     ----------
@@ -43,7 +45,7 @@ def projected_crs_near(
     Returns
     -------
     tuple of str
-        Those of satellite datums first, each once.
+        Those with datums of satellite positioning first, each once.
     """
     area = AreaOfInterest(longitude_deg, latitude_deg, longitude_deg, latitude_deg)
     infos = query_crs_info("EPSG", [PJType.PROJECTED_CRS], area, contains=True)
@@ -51,16 +53,16 @@ def projected_crs_near(
     for info in infos:
         crs = f"EPSG:{info.code}"
         if _is_near(crs, (x, y), (longitude_deg, latitude_deg)):
-            rank = [info.name.startswith(datum) for datum in _USUAL]
-            # 3044 is 25832 with the northing first: kgcp has the easting first in both
-            is_twin = info.name.endswith("(N-E)") or " (zE-N)" in info.name
-            place = rank.index(True) if True in rank else len(rank)
-            near.append((place, is_twin, len(info.name), int(info.code), crs))
+            is_datum = [info.name.startswith(datum) for datum in _SATELLITE_DATUMS]
+            # EPSG:3044 is EPSG:25832 with the northing first; kgcp puts the easting first in both
+            is_northing_first = info.name.endswith("(N-E)") or " (zE-N)" in info.name
+            rank = is_datum.index(True) if True in is_datum else len(is_datum)
+            near.append((rank, is_northing_first, len(info.name), int(info.code), crs))
     return tuple(dict.fromkeys(crs for *_, crs in sorted(near)))
 
 
 def _is_near(crs: str, xy: tuple[float, float], place: tuple[float, float]) -> bool:
-    """Whether a point of a CRS is within kilometres of a place, whatever the datum."""
+    """Tell whether a point of a CRS is within 5 km of a place; datum shifts are neglected."""
     try:
         parsed = CRS.from_user_input(crs)
         geodetic = parsed.geodetic_crs
@@ -70,4 +72,4 @@ def _is_near(crs: str, xy: tuple[float, float], place: tuple[float, float]) -> b
     except ProjError:
         return False
     factor = parsed.axis_info[0].unit_conversion_factor
-    return math.hypot(x - xy[0], y - xy[1]) * factor < _NEAR_M
+    return math.hypot(x - xy[0], y - xy[1]) * factor < _MAX_DISTANCE_M

@@ -1,4 +1,4 @@
-"""Kinematic ground control points: sightings in frames, placed by the vehicle's trajectory."""
+"""Kinematic ground control points: sightings with positions from the vehicle's trajectory."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from kgcp.georef.local_frame import CrsTransform
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import NoPosition, TargetPosition, TargetPositions
 
-_SAME_PLACE = 1e-9  # relative: a millimetre or two of a northing
+_SAME_POSITION_RTOL = 1e-9  # corresponds to some millimetres in a northing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gcp:
-    """One kinematic ground control point: a point of the ground, seen in one frame.
+    """One kinematic ground control point: a target's position, with its image in one frame.
 
     Attributes
     ----------
     id : str
-        `K` and the number of the frame, perhaps behind the flight's name; for a static target its
-        name, in every frame.
+        `K` and the number of the frame, if wanted preceded by the flight's name. A static target
+        has its own name in every frame.
     frame, target : str
         As in the sighting.
     time_s : float or None
         When the target's row was exposed, by the trajectory's clock, Unix UTC [s]; None: not
-        known, which only a static target can afford.
+        known (static targets only).
     position_map : (3,) array
         x, y, z in the flight's CRS.
     cov_m2 : (3, 3) array or None
@@ -41,15 +41,15 @@ class Gcp:
     centre_px, centre_cov_px2, distance_m, sd_distance_m, sd_common_distance_m
         As in the sighting.
     common_m : (3, k) array or None
-        How one standard deviation of each of k errors that all points share moves this one,
-        along the map's axes [m]; k = 4: lever arm x, y, z and synchronisation. It is part of
-        `cov_m2`. None: the target stands still, and its points are one point.
+        Displacements of the point, along the map's axes, by one standard deviation of each of k
+        errors that all points share [m]; k = 4: lever arm x, y, z and synchronisation. They are
+        included in `cov_m2`. None: the target is static, and its points in all frames are one.
     score, ambiguity
         As in the sighting.
     is_checkpoint : bool
-        Whether the point is to check an adjustment instead of controlling it.
+        Whether the point is a check point of the adjustment, not a control point.
     flag : Flag or None
-        What does not fit a smooth flight; None: nothing, or it could not be examined.
+        What does not fit a smooth flight; None: nothing, or not examined.
     """
 
     id: str
@@ -71,7 +71,7 @@ class Gcp:
 
     @property
     def cov_common_m2(self) -> FloatArray | None:
-        """Share (3, 3) of `cov_m2` that is one error in all points [m²]."""
+        """Share (3, 3) of `cov_m2` that is due to errors that all points share [m²]."""
         if self.common_m is None or self.cov_m2 is None:
             return self.cov_m2
         return np.asarray(self.common_m @ self.common_m.T)
@@ -106,7 +106,7 @@ class SkippedSighting:
     frame, target : str
         As in the sighting.
     reason : NoPosition or SkipReason
-        Why it is not known where the target was, or why the point is left out.
+        Why the target's position is unknown, or why the point is left out.
     """
 
     frame: str
@@ -117,26 +117,26 @@ class SkippedSighting:
 def build_gcps(
     sightings: Sequence[Sighting], target_positions: TargetPositions, camera: Camera
 ) -> tuple[tuple[Gcp, ...], tuple[SkippedSighting, ...]]:
-    """Place every sighting on the ground.
+    """Give every sighting its position on the ground.
 
     Parameters
     ----------
     sightings : sequence of Sighting
         In the frames' order.
     camera : Camera
-        For the rolling shutter.
+        Its rolling shutter determines when a target was exposed.
 
     Returns
     -------
     gcps : tuple of Gcp
         In the sightings' order.
     skipped : tuple of SkippedSighting
-        What could not be placed, and why.
+        Sightings without a position, with the reasons.
 
     Raises
     ------
     KgcpError
-        As `TargetPositions.positions`, or if a static target has the id of a moving one's point.
+        As `TargetPositions.positions`, or as `check_ids`.
     """
     first = [sighting for sighting in sightings if sighting.instance == 0]
     times = [sighting.row_time_s(camera) for sighting in first]
@@ -203,39 +203,39 @@ def _gcp(
 
 
 def check_ids(gcps: Sequence[Gcp]) -> None:
-    """Check that points of one id are one point.
+    """Check that points with the same id have the same position.
 
     Raises
     ------
     KgcpError
-        If two of them are at different places.
+        If two of them have different positions.
     """
     first: dict[str, Gcp] = {}
     for point in gcps:
         other = first.setdefault(point.id, point)
-        if np.allclose(point.position_map, other.position_map, rtol=_SAME_PLACE, atol=1e-9):
+        if np.allclose(point.position_map, other.position_map, rtol=_SAME_POSITION_RTOL, atol=1e-9):
             continue
         where = f"in {other.frame} and {point.frame}"
         if point.target != other.target:
             raise KgcpError(
-                f"{point.id!r} is a static target and the point of a moving one {where};"
+                f"{point.id!r} is both a static target and a point of the moving target {where};"
                 " give the static target another name in flight.toml"
             )
         raise KgcpError(
-            f"target {point.id!r} stands at different places {where};"
+            f"static target {point.id!r} has different positions {where};"
             " give one of them another name, or correct position_m"
         )
 
 
 def flight_prefix(name: str) -> str:
-    """Return a flight's name as used in ids and paths: letters, digits, point and hyphen."""
+    """Return a flight's name as used in ids and paths: letters, digits, `_`, `.` and `-`."""
     return re.sub(r"[^\w.-]+", "_", name).strip("_.") or "flight"
 
 
 def with_flight_name(gcps: Sequence[Gcp], name: str) -> tuple[Gcp, ...]:
-    """Return points of which the ids of moving ones begin with the flight's name.
+    """Put the flight's name before the ids of moving targets' points.
 
-    Those of static targets remain: they are the same points in all flights.
+    Ids of static targets stay as they are: they are the same points in all flights.
     """
     prefix = flight_prefix(name)
     return tuple(
@@ -245,7 +245,7 @@ def with_flight_name(gcps: Sequence[Gcp], name: str) -> tuple[Gcp, ...]:
 
 
 def transform_gcps(gcps: Sequence[Gcp], transform: CrsTransform) -> tuple[Gcp, ...]:
-    """Return the points with positions and covariances on another map.
+    """Transform the points' positions and covariances to another map.
 
     Raises
     ------

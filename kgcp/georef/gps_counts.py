@@ -1,18 +1,20 @@
-"""Times that do not count from 1970: seconds of a GPS week, and seconds of GPS since 1980."""
+"""Times that do not count from 1970: seconds of a GPS week, and GPS seconds since 1980."""
 
 from __future__ import annotations
 
 from kgcp.georef.unix_time import date_of
 
 _DAY_S = 86400.0
-_TWO_WEEKS_S = 14 * _DAY_S  # longer than any seconds of the week, with a flight over its end
+# More than any seconds of the week, even if they count on beyond the week's end during a flight.
+_TWO_WEEKS_S = 14 * _DAY_S
 _GPS_EPOCH_S = 315_964_800  # 1980-01-06 as Unix seconds
 
 
 def gps_count_remedy(frames_s: float, trajectory_s: float) -> str | None:
-    """Return what to do about times that count from the start of a GPS week, or of GPS itself.
+    """Return what to do about times that count from the start of a GPS week, or from 1980.
 
-    Both arguments are the first of their kind, taken for Unix seconds. None: they count from 1970.
+    The arguments are the first times of the frames and of the trajectory, read as Unix seconds.
+    None: both count from 1970.
     """
     if 0.0 <= trajectory_s < _TWO_WEEKS_S <= frames_s:
         return (
@@ -31,7 +33,7 @@ def gps_count_remedy(frames_s: float, trajectory_s: float) -> str | None:
     ):
         if abs(behind_s - _GPS_EPOCH_S) < _DAY_S:
             return (
-                f"the {whose} times count from 1980-01-06, as GPS does: add {_GPS_EPOCH_S} s, and"
-                " take off the leap seconds (18 since 2017), to make them Unix seconds"
+                f"the {whose} times count from 1980-01-06, as GPS does: to make them Unix seconds,"
+                f" add {_GPS_EPOCH_S} s and subtract the leap seconds (18 since 2017)"
             )
     return None

@@ -1,9 +1,10 @@
-"""How far a vehicle may be from the interpolation of its trajectory, between the epochs.
+"""Errors of a trajectory's interpolation between its epochs.
 
-Every inner epoch is compared with what its neighbours say of it: a spline through every second
-epoch, and a turn about a fixed axis between the epochs before and after. Their steps are twice as
-long. The error of an interpolation of order p grows with the p-th power of the step, so that of
-the trajectory itself is 2ᵖ times smaller: 16 times for cubic splines, 4 times for turns.
+Every inner epoch is compared with an interpolation without it. For positions this is a spline
+through every second epoch; for attitudes, a turn about a fixed axis from the epoch before to the
+one after. The misfits are errors of an interpolation with twice the step. The error of an
+interpolation of order p grows with the p-th power of the step. The error of the trajectory's own
+interpolation is therefore 2ᵖ times smaller: 16 times for cubic splines, 4 times for turns.
 """
 
 from __future__ import annotations
@@ -14,15 +15,20 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import FloatArray, IndexArray
-from kgcp.georef.trajectory import Motion, spread_samples
+from kgcp.georef.trajectory import Motion, spline_knots
 
 _SPLINE_ORDER, _TURN_ORDER = 4, 2
-# At 1 Hz, steps of driven paths are too long for these orders; docs/method.md has what was found.
+# Factor on the estimated errors. In simulated drives at 1 Hz the steps are too long for the powers
+# above: errors of attitudes are 1/4 to 1/3 of the misfits instead of 1/4, those of positions 1/30
+# to 1/6 instead of 1/16 (docs/method.md, "Points").
 _MARGIN = 4.0 / 3.0
-_NEARBY = np.arange(-1, 3)  # inner epochs about an interval, of which one may fit by chance
-# Variance of what is compared, for epochs with independent errors of variance 1.
+# Epochs around an interval, counted from the one before it. The misfits of four are averaged,
+# because a single one may be small by chance.
+_NEARBY = np.arange(-1, 3)
+# Variance of a misfit if the epochs have independent errors of variance 1.
 _SPLINE_NOISE, _TURN_NOISE = 1.7, 1.5
-# Of a car, where only two epochs follow each other and nothing can be compared.
+# Standard deviations of a car's accelerations. They replace the misfits where no epoch can be left
+# out, because a run between two gaps has two epochs only.
 _ACCELERATION_M_S2, _ANGULAR_ACCELERATION_RAD_S2 = 1.0, 0.1
 
 
@@ -37,8 +43,8 @@ class InterpolationErrors:
 def interpolation_errors(motion: Motion, time_s: FloatArray) -> InterpolationErrors:
     """Estimate the errors at times (n,) that `Motion.coverage` reports to be inside.
 
-    They vanish at the epochs. The noise of epochs, by their standard deviations, makes a part of
-    what is compared; it is taken off, because these deviations count already.
+    They vanish at the epochs. The epochs' own noise contributes to the misfits. Its share, by the
+    stated standard deviations, is subtracted, because it is already part of the states' covariance.
     """
     errors = InterpolationErrors(np.zeros((len(time_s), 3, 3)), np.zeros((len(time_s), 3, 3)))
     left, fraction = motion.place(time_s)
@@ -47,9 +53,10 @@ def interpolation_errors(motion: Motion, time_s: FloatArray) -> InterpolationErr
         chosen = (left >= run[0]) & (left < run[-1])
         if not chosen.any():
             continue
-        knots = run[spread_samples(motion.time_s[run])]
+        knots = run[spline_knots(motion.time_s[run])]
         sampling = _Sampling.of(motion.time_s, knots, left[chosen], fraction[chosen])
-        order = min(_SPLINE_ORDER, len(knots) // 2 + 1)  # of the shorter spline
+        # the spline through every second knot has a lower order if it has few knots
+        order = min(_SPLINE_ORDER, len(knots) // 2 + 1)
         errors.cov_position_m2[chosen] = sampling.covariances(
             _spline_misfits(motion.time_s[knots], motion.position_m[knots]),
             _SPLINE_NOISE * _total_variance(motion.sd_position_m, knots),
@@ -72,7 +79,7 @@ def _total_variance(sd: FloatArray | None, knots: IndexArray) -> FloatArray:
 
 
 def _spline_misfits(time_s: FloatArray, position_m: FloatArray) -> FloatArray:
-    """Return by how much k samples miss a spline through every second one (k, 3); 0 at the ends."""
+    """Return the offsets (k, 3) of k samples from a spline through every second; 0 at the ends."""
     from scipy.interpolate import CubicSpline  # 0.15 s that few commands need
 
     misfits = np.zeros_like(position_m)
@@ -88,9 +95,9 @@ def _spline_misfits(time_s: FloatArray, position_m: FloatArray) -> FloatArray:
 def _turn_misfits(
     time_s: FloatArray, frame_from_body: FloatArray, wanted: IndexArray
 ) -> FloatArray:
-    """Return by how much k samples miss the turn between their neighbours (k, 3).
+    """Return the rotations (k, 3) of k samples from the turn between their neighbours [rad].
 
-    Of those not wanted, and at the ends, it is 0.
+    They are 0 for the samples that are not wanted, and at the ends.
     """
     misfits = np.zeros((len(time_s), 3))
     rows = wanted[(wanted > 0) & (wanted < len(time_s) - 1)]
@@ -100,20 +107,20 @@ def _turn_misfits(
         )
         share = (time_s[rows] - time_s[rows - 1]) / (time_s[rows + 1] - time_s[rows - 1])
         turn = (after * before.inv()).as_rotvec()
-        between = Rotation.from_rotvec(share[:, None] * turn) * before
-        misfits[rows] = (here * between.inv()).as_rotvec()
+        interpolated = Rotation.from_rotvec(share[:, None] * turn) * before
+        misfits[rows] = (here * interpolated.inv()).as_rotvec()
     return misfits
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sampling:
-    """Where n times lie among the k knots of a path."""
+    """How n times lie among the k knots of a path, which are epochs, but need not be all."""
 
-    step_s: FloatArray  # (n,): between the knots about them
-    share: FloatArray  # (n,): of that step, which the epochs about them take
-    bulge: FloatArray  # (n,): 1 in the middle between two epochs, 0 at both, a parabola between
-    nearby: IndexArray  # (n, 4): knots near them
-    is_inner: FloatArray  # (n, 4): 1 for those that can be compared, 0 at and beyond the ends
+    step_s: FloatArray  # (n,): interval between the knots on either side
+    share: FloatArray  # (n,): interval between the epochs on either side, over `step_s`
+    bulge: FloatArray  # (n,): parabola between these epochs: 0 at both, 1 in the middle
+    nearby: IndexArray  # (n, 4): nearby knots, by number
+    is_inner: FloatArray  # (n, 4): 1 for nearby knots that have a misfit, 0 at and beyond the ends
     # (k,): product of the steps before and after each knot [s²]; 1 at the ends
     steps_s2: FloatArray
 
@@ -121,7 +128,7 @@ class _Sampling:
     def of(
         cls, time_s: FloatArray, knots: IndexArray, left: IndexArray, fraction: FloatArray
     ) -> _Sampling:
-        """Find where times lie, by the epoch before each and the share of the way to the next."""
+        """Find how times lie, given the epoch before each and the share of the way to the next."""
         last = len(knots) - 1
         steps = np.diff(time_s[knots])
         interval = np.clip(np.searchsorted(knots, left, side="right") - 1, 0, last - 1)
@@ -136,32 +143,34 @@ class _Sampling:
     def covariances(
         self, misfits: FloatArray, noise: FloatArray, order: int, acceleration: float
     ) -> FloatArray:
-        """Return the covariances (n, 3, 3) that the misfits (k, 3) nearby let expect.
+        """Return the covariances (n, 3, 3) to be expected from the misfits (k, 3) nearby.
 
         Parameters
         ----------
         noise : (k,) array
-            Sum of the variances that the epochs' noise gives to the three misfits.
+            Share of the epochs' noise in the sum of the three misfits' variances.
         order : int
-            With which power of the step the misfits grow.
+            Power of the step with which the misfits grow.
         acceleration : float
-            Standard deviation of that along each axis, where no misfit is known.
+            Its standard deviation along each axis; used where there is no misfit.
         """
-        unseen = np.eye(3) * (acceleration * self.step_s**2 / 8.0)[:, None, None] ** 2
-        # with the square of the step, to the square of what the other path had at its epoch
+        without_misfits = np.eye(3) * (acceleration * self.step_s**2 / 8.0)[:, None, None] ** 2
+        # square of (step / misfit's step)ᵖ, the latter twice the geometric mean of its two steps
         weight = (
             self.is_inner
             * (self.step_s[:, None] ** 2 / (4.0 * self.steps_s2[self.nearby])) ** order
         )
         count = np.maximum(self.is_inner.sum(axis=1), 1.0)
-        beside = misfits[self.nearby]
-        mean = np.einsum("nk,nki,nkj->nij", weight, beside, beside) / count[:, None, None]
+        around = misfits[self.nearby]
+        mean = np.einsum("nk,nki,nkj->nij", weight, around, around) / count[:, None, None]
         total = np.trace(mean, axis1=1, axis2=2)
         excess = total - np.sum(weight * noise[self.nearby], axis=1) / count
-        real = np.divide(excess, total, out=np.zeros_like(total), where=total > 0.0)
-        seen = _MARGIN**2 * np.maximum(real, 0.0)[:, None, None] * mean
-        # a smooth path leaves its spline near a knot more slowly, one of coarse steps like this;
-        # epochs that are no knots bring the path nearer, by the square of the step between them
+        beyond_noise = np.divide(excess, total, out=np.zeros_like(total), where=total > 0.0)
+        by_misfits = _MARGIN**2 * np.maximum(beyond_noise, 0.0)[:, None, None] * mean
+        # With coarse steps the error grows from an epoch like this parabola, on a smooth path more
+        # slowly. Epochs that are not knots reduce it with the square of the interval between them.
         shape = (self.bulge * self.share**2) ** 2
-        is_seen = np.any(self.is_inner > 0.0, axis=1, keepdims=True)
-        return np.asarray(np.where(is_seen[:, :, None], seen, unseen) * shape[:, None, None])
+        has_misfits = np.any(self.is_inner > 0.0, axis=1, keepdims=True)
+        return np.asarray(
+            np.where(has_misfits[:, :, None], by_misfits, without_misfits) * shape[:, None, None]
+        )

@@ -1,9 +1,9 @@
-"""A map's local Cartesian frame, and the way from one map to another.
+"""A map's local Cartesian frame, and the transformation from one map to another.
 
-Map → the CRS's own geodetic coordinates (no datum shift) → Earth-centred Cartesian → local
+Map → the CRS's own geodetic coordinates (no datum shift) → Earth-centred Cartesian (ECEF) → local
 east, north, up (ENU) in metres, tangent to the ellipsoid at an origin. Distances, lever arms and
-attitudes are only meaningful in the latter: a grid shrinks 80 m by 32 mm in the middle of a UTM
-zone, and its north is not true north.
+attitudes are meaningful in ENU only: in the middle of a UTM zone, the grid shortens 80 m by 32 mm,
+and its north is not true north.
 """
 
 from __future__ import annotations
@@ -27,17 +27,18 @@ from kgcp.georef.crs import (
     unusable,
 )
 
-_JACOBIAN_STEP_M = 10.0  # curvature cancels in the central difference, rounding stays below 1e-9
-_STEP_M, _STEP_DEG = 10.0, 1e-4  # along a map's y axis, for the same reason
+# Half the base of central differences. In these, curvature cancels; rounding stays below 1e-9.
+_JACOBIAN_STEP_M = 10.0
+_STEP_M, _STEP_DEG = 10.0, 1e-4  # the same along a map's y axis, projected and geographic
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalFrame:
-    """A map and a local ENU frame over one point of it.
+    """A map and a local ENU frame with its origin at one point of the map.
 
     Map coordinates are x = easting or longitude, y = northing or latitude, in this order and in
-    the CRS's own units, and z = height: ellipsoidal and in metres unless the CRS is compound;
-    a compound CRS says itself what its heights are.
+    the CRS's own units, and z = height. A compound CRS defines its heights itself; otherwise they
+    are ellipsoidal and in metres.
     """
 
     crs: str  # as in flight.toml
@@ -52,7 +53,7 @@ class LocalFrame:
     def at(cls, crs: str, origin_map: FloatArray, where: str = CRS_KEY) -> Self:
         """Return the frame of `crs` (anything pyproj reads) over the point (3,) `origin_map`.
 
-        `where` is what an error names as the place that the CRS was given in.
+        `where` tells where the CRS was given; error messages begin with it.
 
         Raises
         ------
@@ -73,7 +74,7 @@ class LocalFrame:
         geodetic_from_map = best_transformer(
             horizontal,
             geodetic.to_3d(),
-            f"{where} {crs!r}: the way from its heights to ellipsoidal ones",
+            f"{where} {crs!r}: the transformation from its heights to ellipsoidal ones",
             "give ellipsoidal heights and the horizontal CRS alone",
         )
         cart = Transformer.from_pipeline(
@@ -89,12 +90,12 @@ class LocalFrame:
         )
 
     def enu_from_map(self, xyz: FloatArray) -> FloatArray:
-        """Bring map points (n, 3) into the ENU frame (n, 3) [m]."""
+        """Transform map points (n, 3) into the ENU frame (n, 3) [m]."""
         ecef = self._ecef(self._geodetic(np.asarray(xyz, dtype=np.float64)))
         return (ecef - self.origin_ecef_m) @ self.ecef_from_enu
 
     def map_from_enu(self, enu: FloatArray) -> FloatArray:
-        """Bring points (n, 3) of the ENU frame [m] into the map (n, 3)."""
+        """Transform points (n, 3) of the ENU frame [m] into the map (n, 3)."""
         geodetic = self._geodetic_from_enu(enu)
         geodetic[:, :2] /= self._radians_per_unit
         return self._transform(self._geodetic_from_map, geodetic, TransformDirection.INVERSE)
@@ -109,7 +110,7 @@ class LocalFrame:
     def geodetic_deg(self, enu: FloatArray) -> FloatArray:
         """Return longitude, latitude [deg] and ellipsoidal height [m] (n, 3) of ENU points.
 
-        They belong to the datum of the map.
+        Their datum is that of the map.
         """
         geodetic = self._geodetic_from_enu(enu)
         geodetic[:, :2] = np.degrees(geodetic[:, :2])
@@ -129,8 +130,9 @@ class LocalFrame:
     def grid_rotation(self, enu: FloatArray) -> FloatArray:
         """Return the rotations (..., 3, 3) from the map's axes to ENU at points (..., 3).
 
-        Their columns are the directions of map x, y and z there, made orthonormal by the polar
-        decomposition: meridian convergence and the change of the vertical, without the scale.
+        Their columns are the directions of map x, y and z there, made orthonormal by polar
+        decomposition. They contain the meridian convergence and the change of the vertical, but
+        not the scale.
 
         Raises
         ------
@@ -141,8 +143,8 @@ class LocalFrame:
         lengths = np.linalg.norm(jacobian, axis=-1, keepdims=True)
         if not np.all((lengths > 0.0) & np.isfinite(lengths)):  # for example deep inside the Earth
             raise KgcpError(
-                f"{self._where} {self.crs!r} has no directions at a point of its file;"
-                " give the CRS of the coordinates"
+                f"{self._where} {self.crs!r}: the directions of its axes are not defined at a"
+                " point of the file; give the CRS of the coordinates"
             )
         rows = jacobian / lengths
         left, _, right = np.linalg.svd(rows)
@@ -184,11 +186,11 @@ class LocalFrame:
         except ProjError as error:
             raise unusable(self.crs, error, self._where) from error
         result = np.column_stack(columns).astype(np.float64)
-        lost = np.flatnonzero(~np.isfinite(result).all(axis=1))
-        if lost.size:
-            point = ", ".join(f"{value:.10g}" for value in points[lost[0]])
+        invalid = np.flatnonzero(~np.isfinite(result).all(axis=1))
+        if invalid.size:
+            point = ", ".join(f"{value:.10g}" for value in points[invalid[0]])
             raise KgcpError(
-                f"{self._where} {self.crs!r} cannot hold the point ({point});"
+                f"{self._where} {self.crs!r} does not cover the point ({point});"
                 " give the CRS of the coordinates, x = easting or longitude first"
             )
         return result
@@ -208,8 +210,8 @@ def _level_axes(geodetic: FloatArray) -> FloatArray:
 def map_axes_ecef(crs: str, position: FloatArray) -> FloatArray:
     """Return the axes x, y, z of a CRS at positions (n, 3), as columns in ECEF, (n, 3, 3).
 
-    Orthonormal: z is the ellipsoid's normal, y the map's y made square to it. Geocentric axes are
-    those of ECEF.
+    They are orthonormal: z is the ellipsoid's normal, y is the map's y made perpendicular to it.
+    The axes of a geocentric CRS are those of ECEF.
     """
     parsed = parse_crs(crs, VEHICLE_CRS)
     if parsed.is_geocentric:
@@ -238,59 +240,60 @@ def level_axes_ecef(crs: str, position: FloatArray) -> FloatArray:
 def turn_covariances(
     cov_m2: FloatArray, old_axes_ecef: FloatArray, new_axes_ecef: FloatArray
 ) -> FloatArray:
-    """Bring covariances (n, 3, 3) from one set of axes (n, 3, 3) to another."""
+    """Rotate covariances (n, 3, 3) from one set of axes (n, 3, 3) to another."""
     turn = np.swapaxes(new_axes_ecef, -1, -2) @ old_axes_ecef
     return np.asarray(turn @ cov_m2 @ np.swapaxes(turn, -1, -2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CrsTransform:
-    """The way from the flight's map to another one, datum and geoid included."""
+    """The transformation from the flight's map to another one, datum and geoid included."""
 
-    source: LocalFrame  # the flight's
+    source: LocalFrame  # of the flight's CRS
     target: LocalFrame  # of the other CRS
     _between: Transformer
     _where: str
 
     @classmethod
     def to(cls, crs: str, source: LocalFrame, near_map: FloatArray, where: str = "crs") -> Self:
-        """Prepare the way to `crs` (anything pyproj reads) about the point (3,) of the source map.
+        """Prepare the transformation to `crs` (anything pyproj reads).
 
-        `where` is what an error names as the place that the CRS was given in.
+        The target's frame has its origin at `near_map` (3,), a point of the source map. `where`
+        tells where the CRS was given; error messages begin with it.
 
         Raises
         ------
         KgcpError
-            If the CRS is unknown or unusable, no exact operation leads to it, or one that PROJ
-            knows needs a grid that is not installed.
+            If the CRS is unknown or unusable, if no exact operation leads to it, or if that
+            operation needs a grid that is not installed.
         """
         between = best_transformer(
             parse_crs(source.crs),
             parse_crs(crs, where),
-            f"{where} {crs!r}: the way from {source.crs!r}",
+            f"{where} {crs!r}: the transformation from {source.crs!r}",
         )
         draft = cls(source, source, between, where)
         target = LocalFrame.at(crs, draft.positions(np.reshape(near_map, (1, 3)))[0], where)
         return cls(source, target, between, where)
 
     def positions(self, xyz: FloatArray) -> FloatArray:
-        """Bring points (n, 3) of the source map into the other one (n, 3)."""
+        """Transform points (n, 3) of the source map into the other one (n, 3)."""
         x, y, z = np.asarray(xyz, dtype=np.float64).T
         try:
-            moved = np.column_stack(self._between.transform(x, y, z, errcheck=True))
+            transformed = np.column_stack(self._between.transform(x, y, z, errcheck=True))
         except ProjError as error:
             text = " ".join(str(error).split())
             raise KgcpError(
-                f"{self._where}: {self.source.crs!r} does not lead to that CRS"
+                f"{self._where}: points in {self.source.crs!r} cannot be transformed to that CRS"
                 f" ({text}); give one that covers the flight"
             ) from error
-        return moved
+        return transformed
 
     def axes(self, xyz: FloatArray) -> FloatArray:
         """Return the rotations (..., 3, 3) from the source map's axes to the other's at (..., 3).
 
-        Both maps are compared with east, north and up of the same place: the directions of
-        datums differ by some 1e-5, which does not matter for standard deviations.
+        Both maps are compared with east, north and up at the same place. These directions differ
+        between datums by some 1e-5 rad, which does not matter for standard deviations.
         """
         points = np.reshape(np.asarray(xyz, dtype=np.float64), (-1, 3))
         from_source = _level_from_grid(self.source, points)

@@ -1,7 +1,7 @@
-"""Which of a plate's two normals the frames before and after make the likelier one.
+"""Which of a plate's two possible normals agrees with the frames before and after.
 
 For a camera that looks down at a plate on a roof, the normal changes little from frame to frame.
-The frames whose image alone decides between the two show how little.
+How little is estimated from the frames in which the image alone decides between the two normals.
 """
 
 from __future__ import annotations
@@ -17,81 +17,81 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.plate_prior import NormalPrior
 from kgcp.measurement.records import FrameResult, Measurement
 
-_SURE = 10.0  # Δχ² of the image above which one frame may decide for another
-_FEWEST = 4  # pairs of neighbours from which the difference of normals is estimated
-_FARTHEST = 3.0  # times the usual interval between neighbours
-_MEDIAN_OF_2D = 1.1774  # of the distance from the centre of a normal distribution, in σ
-_LEAST_SD_DEG = 1.0
+_CLEAR_AMBIGUITY = 10.0  # least Δχ² by the image of frames that may decide for others
+_MIN_PAIRS = 4  # of neighbours from which the difference of normals is estimated
+_MAX_INTERVALS = 3.0  # largest interval between neighbours, in medians
+_MEDIAN_OF_2D = 1.1774  # median distance from the centre of a 2-D normal distribution, in σ
+_MIN_SD_DEG = 1.0  # of a normal against its neighbours
 
 Place = tuple[str, str, int]
 """Frame, target and instance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Seen:
+class _TimedMeasurement:
     place: Place
-    time_s: float
+    time_s: float  # of the frame
     measurement: Measurement
 
     @property
     def ambiguity(self) -> float:
-        """Δχ² by which the other normal is worse; infinite without another."""
+        """Δχ² by which the other normal is worse; infinite if there is none."""
         other = self.measurement.alternative
         return math.inf if other is None else other.ambiguity
 
 
 def preferences_of_neighbours(results: Iterable[FrameResult]) -> Mapping[Place, float]:
-    """Return by how much more χ² the other normal has, for normals of which the image is not sure.
+    """Return Δχ² by which neighbouring frames make the other normal worse, for ambiguous normals.
 
-    Where no neighbours tell, or not enough, there is no entry.
+    There is no entry where the image alone decides, or where neighbours are missing or too few.
 
     Parameters
     ----------
     results : iterable of FrameResult
-        Of all frames. Their order does not matter.
+        Of all frames, in any order.
     """
-    tracks: dict[tuple[str, int], list[_Seen]] = defaultdict(list)
+    tracks: dict[tuple[str, int], list[_TimedMeasurement]] = defaultdict(list)
     for result in results:
         for outcome in result.outcomes:
             if isinstance(outcome, Measurement) and result.time_s is not None:
                 place = (result.frame, outcome.target, outcome.instance)
-                tracks[place[1:]].append(_Seen(place, result.time_s, outcome))
+                tracks[place[1:]].append(_TimedMeasurement(place, result.time_s, outcome))
     preferences: dict[Place, float] = {}
     for track in tracks.values():
-        preferences |= _preferences(sorted(track, key=lambda seen: (seen.time_s, seen.place)))
+        preferences |= _preferences(sorted(track, key=lambda timed: (timed.time_s, timed.place)))
     return preferences
 
 
-def _preferences(track: list[_Seen]) -> dict[Place, float]:
-    """Return the preferences in the frames of one target, in the order of time."""
-    sure = [seen for seen in track if seen.ambiguity >= _SURE]
-    if len(sure) <= _FEWEST:
+def _preferences(track: list[_TimedMeasurement]) -> dict[Place, float]:
+    """Return the preferences for one target; its measurements are in the order of time."""
+    clear = [timed for timed in track if timed.ambiguity >= _CLEAR_AMBIGUITY]
+    if len(clear) <= _MIN_PAIRS:
         return {}
-    times_s = np.array([seen.time_s for seen in sure])
-    normals = np.array([seen.measurement.pose.normal for seen in sure])
-    longest_s = _FARTHEST * float(np.median(np.diff(times_s)))
+    times_s = np.array([timed.time_s for timed in clear])
+    normals = np.array([timed.measurement.pose.normal for timed in clear])
+    longest_s = _MAX_INTERVALS * float(np.median(np.diff(times_s)))
     is_near = np.diff(times_s) <= longest_s
     angles_deg = np.degrees(np.arccos(np.clip(np.sum(normals[1:] * normals[:-1], axis=1), -1, 1)))
-    if is_near.sum() < _FEWEST:
+    if is_near.sum() < _MIN_PAIRS:
         return {}
-    sd_deg = max(float(np.median(angles_deg[is_near])) / _MEDIAN_OF_2D, _LEAST_SD_DEG)
+    sd_deg = max(float(np.median(angles_deg[is_near])) / _MEDIAN_OF_2D, _MIN_SD_DEG)
     preferences = {}
-    for seen in track:
-        measurement, other = seen.measurement, seen.measurement.alternative
-        if other is None or other.ambiguity >= _SURE or measurement.uncertainty is None:
+    for timed in track:
+        measurement, other = timed.measurement, timed.measurement.alternative
+        if other is None or other.ambiguity >= _CLEAR_AMBIGUITY or measurement.uncertainty is None:
             continue
-        direction = _direction(times_s, normals, seen.time_s, longest_s)
-        if direction is not None:
+        normal = _neighbours_normal(times_s, normals, timed.time_s, longest_s)
+        if normal is not None:
             rotation_cov = measurement.uncertainty.pose_cov[3:, 3:]
-            prior = NormalPrior(direction, sd_deg)
-            preferences[seen.place] = prior.preference(measurement.pose, other.pose, rotation_cov)
+            prior = NormalPrior(normal, sd_deg)
+            preferences[timed.place] = prior.preference(measurement.pose, other.pose, rotation_cov)
     return preferences
 
 
-def _direction(
+def _neighbours_normal(
     times_s: FloatArray, normals: FloatArray, time_s: float, longest_s: float
 ) -> FloatArray | None:
-    """Return the mean normal of the frames just before and after a moment; None if all are far."""
+    """Return the mean normal of the frames just before and after a time; None if both are far."""
     after = int(np.searchsorted(times_s, time_s))
     near = [
         index

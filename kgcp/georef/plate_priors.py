@@ -1,7 +1,7 @@
-"""What vehicle, camera and earlier frames say about a plate before its frame is looked at.
+"""The expected normal of the vehicle's plate in a frame, before the frame is measured.
 
-Where the attitude of the camera is known, so is the direction of a plate's normal in it: that of
-the vehicle's downward axis, or of the vertical for a plate that lies level.
+If the attitude of the camera is known, so is the direction of the plate's normal in the camera
+frame: that of the vehicle's downward axis, or of the vertical for a level plate.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from kgcp.georef.target_positions import Vehicle
 from kgcp.georef.trajectory import Coverage
 from kgcp.measurement.plate_prior import NormalPrior
 
-_ALONG_AXIS: FloatArray = np.array([0.0, 0.0, 1.0])
-_MOUNTED_SD_DEG = 3.0  # of a plate on a roof against the vehicle's axes, if nothing is said of it
+_OPTICAL_AXIS: FloatArray = np.array([0.0, 0.0, 1.0])
+_UNSTATED_MOUNT_SD_DEG = 3.0  # of a plate on a roof against the vehicle's axes, if none is given
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraAttitudes:
     """What is known of the camera's attitude."""
 
-    poses: ReferencePoses | None  # one without deviation counts as exact
-    # standard deviation of the optical axis against the vertical, about either horizontal axis, of
-    # frames without a pose [deg]; None: nothing is known of them
+    poses: ReferencePoses | None  # those without standard deviations count as exact
+    # standard deviation of the optical axis from the vertical, about either horizontal axis, in
+    # frames without a pose [deg]; None: their attitude is unknown
     plumb_sd_deg: float | None
 
     def sd_deg(self, row: int) -> float:
@@ -46,20 +46,20 @@ def normal_priors(
     vehicle: Vehicle | None,
     level_sd_deg: float | None,
 ) -> list[NormalPrior | None]:
-    """Return for each frame where the normal of the vehicle's plate should point.
+    """Return for each frame in which direction the normal of the vehicle's plate should point.
 
     Within the trajectory it follows from the vehicle's attitude. Elsewhere the plate is taken as
-    level, if `level_sd_deg` is given.
+    level if `level_sd_deg` is given.
 
     Parameters
     ----------
     frames : sequence of str
         Names as in the poses.
     time_s : sequence of float or None
-        Of the frames, Unix UTC [s]; None: not known yet.
+        Times of the frames, Unix UTC [s]; None: not known yet.
     level_sd_deg : float or None
-        Of the plate's normal against the vehicle's downward axis or against the vertical, about
-        either horizontal axis [deg]; None: not given.
+        Standard deviation of the plate's normal from the vehicle's downward axis, or from the
+        vertical, about either horizontal axis [deg]; None: not given.
     """
     poses = attitudes.poses
     rows = {} if poses is None else {frame: row for row, frame in enumerate(poses.frames)}
@@ -77,7 +77,7 @@ def normal_priors(
         by_frame |= _by_vehicle(timed, rows, attitudes, poses, vehicle, level_sd_deg)
     plumb = None
     if attitudes.plumb_sd_deg is not None and level_sd_deg is not None:
-        plumb = NormalPrior(_ALONG_AXIS, math.hypot(level_sd_deg, attitudes.plumb_sd_deg))
+        plumb = NormalPrior(_OPTICAL_AXIS, math.hypot(level_sd_deg, attitudes.plumb_sd_deg))
     return [by_frame.get(frame, plumb) for frame in frames]
 
 
@@ -89,7 +89,7 @@ def _by_vehicle(
     vehicle: Vehicle,
     level_sd_deg: float | None,
 ) -> dict[str, NormalPrior]:
-    """Return where the vehicle's downward axis points in the frames of these times."""
+    """Return priors along the vehicle's downward axis, for frames within the trajectory."""
     times = np.array(list(time_s.values()), dtype=np.float64)
     inside = [kind is Coverage.INSIDE for kind in vehicle.coverage(times)]
     frames = [frame for frame, is_inside in zip(time_s, inside, strict=True) if is_inside]
@@ -99,12 +99,12 @@ def _by_vehicle(
     tilt_sd_deg = np.zeros(len(frames))
     if states.sd_attitude_deg is not None:
         tilt_sd_deg = states.sd_attitude_deg[:, :2].max(axis=1)
-    mounted_sd_deg = _MOUNTED_SD_DEG if level_sd_deg is None else level_sd_deg
+    mount_sd_deg = _UNSTATED_MOUNT_SD_DEG if level_sd_deg is None else level_sd_deg
     orientations = ExteriorOrientations.of(poses, vehicle.local_frame)
     priors = {}
     for index, frame in enumerate(frames):
         row = rows[frame]
         down = orientations.enu_from_camera[row].T @ states.frame_from_body[index, :, 2]
-        sd_deg = math.hypot(mounted_sd_deg, attitudes.sd_deg(row), float(tilt_sd_deg[index]))
+        sd_deg = math.hypot(mount_sd_deg, attitudes.sd_deg(row), float(tilt_sd_deg[index]))
         priors[frame] = NormalPrior(down, sd_deg)
     return priors

@@ -1,4 +1,4 @@
-"""Selection of points: good enough, far enough apart, fitting a smooth flight."""
+"""Selection of points that are precise, far enough apart and consistent with a smooth flight."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from kgcp.settings import require_range
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Limits for the points that are handed over; None: no limit.
+    """Criteria for the points that are exported; None: no limit.
 
     Attributes
     ----------
     max_sd_m : float or None
-        Longest semi-axis of the position's standard ellipsoid [m].
+        Limit of the longest semi-axis of the position's standard ellipsoid [m].
     min_score, min_ambiguity : float or None
-        As the columns of the detections.
+        Limits of the columns of the detections.
     min_spacing_m : float
         Least distance along the track [m].
     checkpoint_share : float
-        Share of the points that are to check, 0 … 1.
+        Share of the points that become check points, 0 … 1.
     keep_flagged : bool
-        Whether points that do not fit a smooth flight stay.
+        Whether points that do not fit a smooth flight are kept.
     excluded : tuple of (str, str)
-        Frames, and targets in them, that are not wanted; an empty target means all.
+        Pairs of frame and target that are left out; an empty target means all in the frame.
     """
 
     max_sd_m: float | None = None
@@ -58,10 +58,10 @@ class Selection:
         require_range("checkpoint_share", self.checkpoint_share, 0.0, 1.0)
 
 
-def leave_out(
+def exclude(
     sightings: Sequence[Sighting], excluded: Sequence[tuple[str, str]]
 ) -> tuple[list[Sighting], tuple[SkippedSighting, ...]]:
-    """Return the sightings that are wanted, and the others.
+    """Return the sightings that are not excluded, and those that are.
 
     Parameters
     ----------
@@ -83,47 +83,47 @@ def select(
     sightings: Sequence[Sighting],
     local_frame: LocalFrame,
     camera: Camera,
-    wanted: Selection,
+    selection: Selection,
 ) -> tuple[tuple[Gcp, ...], tuple[SkippedSighting, ...]]:
-    """Return the points to hand over, flagged and with their roles, and those left out.
+    """Return the points to export, with flags and roles, and the sightings left out.
 
     Parameters
     ----------
     sightings : sequence of Sighting
-        In which they were seen.
+        From which the points were made.
     local_frame : LocalFrame
         Of the points' positions.
     """
-    good, faulty = pass_gates(flag_jumps(gcps, sightings, local_frame), wanted)
-    spaced, close = thin(good, local_frame, camera, wanted.min_spacing_m)
-    return set_checkpoints(spaced, local_frame, wanted.checkpoint_share), (*faulty, *close)
+    passed, failed = apply_limits(flag_jumps(gcps, sightings, local_frame), selection)
+    spaced, close = thin_out(passed, local_frame, camera, selection.min_spacing_m)
+    return set_checkpoints(spaced, local_frame, selection.checkpoint_share), (*failed, *close)
 
 
-def explain_none_left(
-    gcps: Sequence[Gcp], skipped: Sequence[SkippedSighting], wanted: Selection
+def explain_empty_selection(
+    gcps: Sequence[Gcp], skipped: Sequence[SkippedSighting], selection: Selection
 ) -> str:
-    """Return, in one line, what all points have failed on, and how good the best one is.
+    """Return, in one line, why all points were left out, and how good the best one is.
 
     Parameters
     ----------
     gcps : sequence of Gcp
         Before the selection; at least one.
     skipped : sequence of SkippedSighting
-        By the selection.
+        Those that the selection left out.
     """
-    counts = Counter(each.reason.value for each in skipped)
+    counts = Counter(sighting.reason.value for sighting in skipped)
     reasons = ", ".join(f"{count} {reason}" for reason, count in counts.most_common())
     best = []
-    if wanted.max_sd_m is not None:
+    if selection.max_sd_m is not None:
         sds_m = [longest_semi_axis(point.cov_m2) for point in gcps]
         best.append(_best("standard deviation", np.fmin.reduce(sds_m), " m"))
-    if wanted.min_score is not None:
-        best.append(_best("score", np.fmax.reduce([_or_nan(point.score) for point in gcps])))
-    if wanted.min_ambiguity is not None:
-        values = [_or_nan(point.ambiguity) for point in gcps]
+    if selection.min_score is not None:
+        best.append(_best("score", np.fmax.reduce([_nan_if_none(point.score) for point in gcps])))
+    if selection.min_ambiguity is not None:
+        values = [_nan_if_none(point.ambiguity) for point in gcps]
         best.append(_best("ambiguity", np.fmax.reduce(values)))
     shown = f"; {', '.join(best)}" if best else ""
-    return f"no points left after selection: {reasons} of {len(gcps)}{shown}; select less strictly"
+    return f"no points left after selection: {reasons} of {len(gcps)}{shown}; relax the limits"
 
 
 def _best(name: str, value: float, unit: str = "") -> str:
@@ -133,18 +133,19 @@ def _best(name: str, value: float, unit: str = "") -> str:
 def flag_jumps(
     gcps: Sequence[Gcp], sightings: Sequence[Sighting], local_frame: LocalFrame
 ) -> tuple[Gcp, ...]:
-    """Flag points whose distance, or camera height, jumps out of a smooth flight.
+    """Flag points at which the distance or the camera's height jumps out of a smooth flight.
 
-    Both follow parabolas over some frames: the distance between camera and target, and the
-    camera's height above the map, which is the point's plus that above the plate. The plate's
-    normal carries the latter, so that a camera under any tilt will do.
+    In a smooth flight both follow parabolas over some frames: the distance between camera and
+    target, and the camera's height. The latter is the height of the point plus that of the camera
+    above the plate, measured along the plate's normal. It therefore does not depend on the camera's
+    tilt.
 
     Parameters
     ----------
     gcps : sequence of Gcp
-        Those of static targets are passed over.
+        Those of static targets are not examined.
     sightings : sequence of Sighting
-        In which they were seen.
+        From which the points were made.
     local_frame : LocalFrame
         Of the points' positions.
     """
@@ -155,10 +156,10 @@ def flag_jumps(
         return tuple(gcps)
     times = np.array([gcps[index].time_s for index in order], dtype=np.float64)
     ups = local_frame.enu_from_map(np.array([gcps[index].position_map for index in order]))[:, 2]
-    sights = [sighting_of[gcps[index].frame, gcps[index].target] for index in order]
+    ordered = [sighting_of[gcps[index].frame, gcps[index].target] for index in order]
     series = {
-        Flag.DISTANCE: np.array([(each.distance_m, each.sd_distance_m or 0.0) for each in sights]),
-        Flag.HEIGHT: np.array([_height(each, up) for each, up in zip(sights, ups, strict=True)]),
+        Flag.DISTANCE: np.array([(each.distance_m, each.sd_distance_m or 0.0) for each in ordered]),
+        Flag.HEIGHT: np.array([_height(each, up) for each, up in zip(ordered, ups, strict=True)]),
     }
     flagged = list(gcps)
     for flag, values in series.items():
@@ -173,7 +174,8 @@ def flag_jumps(
 def _height(sighting: Sighting, up_m: float) -> tuple[float, float]:
     """Return the camera's height and its standard deviation [m]; NaN without a pose.
 
-    h = n·t with the plate's normal n = R e_z: dh = n·dt + (n × t)·dδ for a left rotation δ.
+    The height above the plate is n·t with the plate's normal n = R e_z. Its error is
+    n·dt + (n × t)·dδ for a left rotation δ.
     """
     pose, cov = sighting.pose, sighting.pose_cov
     if pose is None or cov is None:
@@ -183,77 +185,80 @@ def _height(sighting: Sighting, up_m: float) -> tuple[float, float]:
     return up_m + float(normal @ sight), float(np.sqrt(effect @ cov @ effect))
 
 
-def pass_gates(
-    gcps: Sequence[Gcp], gates: Selection
+def apply_limits(
+    gcps: Sequence[Gcp], limits: Selection
 ) -> tuple[tuple[Gcp, ...], tuple[SkippedSighting, ...]]:
-    """Return the points that are good enough, and the others with the reason for each.
+    """Return the points within the limits, and the others with the reason for each.
 
-    A value that is not known does not pass the gate that asks for it.
+    A point whose value is unknown fails the limit on that value.
     """
     kept, skipped = [], []
     for point in gcps:
-        fault = _fault(point, gates)
-        if fault is None:
+        reason = _reason_to_skip(point, limits)
+        if reason is None:
             kept.append(point)
         else:
-            skipped.append(SkippedSighting(point.frame, point.target, fault))
+            skipped.append(SkippedSighting(point.frame, point.target, reason))
     return tuple(kept), tuple(skipped)
 
 
-def _fault(point: Gcp, gates: Selection) -> SkipReason | None:
-    if point.flag is not None and not gates.keep_flagged:
+def _reason_to_skip(point: Gcp, limits: Selection) -> SkipReason | None:
+    if point.flag is not None and not limits.keep_flagged:
         return SkipReason(point.flag.value)
-    if gates.max_sd_m is not None and not longest_semi_axis(point.cov_m2) <= gates.max_sd_m:
+    if limits.max_sd_m is not None and not longest_semi_axis(point.cov_m2) <= limits.max_sd_m:
         return SkipReason.UNCERTAIN
-    if gates.min_score is not None and not _or_nan(point.score) >= gates.min_score:
+    if limits.min_score is not None and not _nan_if_none(point.score) >= limits.min_score:
         return SkipReason.LOW_SCORE
-    if gates.min_ambiguity is not None and not _or_nan(point.ambiguity) >= gates.min_ambiguity:
+    if (
+        limits.min_ambiguity is not None
+        and not _nan_if_none(point.ambiguity) >= limits.min_ambiguity
+    ):
         return SkipReason.AMBIGUOUS
     return None
 
 
-def _or_nan(value: float | None) -> float:
+def _nan_if_none(value: float | None) -> float:
     return np.nan if value is None else value
 
 
 def longest_semi_axis(cov: FloatArray | None) -> float:
-    """Return the longest semi-axis of a standard ellipsoid; NaN where it is not known."""
+    """Return the longest semi-axis of a standard ellipsoid; NaN if it is not known."""
     return np.nan if cov is None else float(np.sqrt(np.linalg.eigvalsh(cov)[-1]))
 
 
-def thin(
+def thin_out(
     gcps: Sequence[Gcp], local_frame: LocalFrame, camera: Camera, min_spacing_m: float
 ) -> tuple[tuple[Gcp, ...], tuple[SkippedSighting, ...]]:
-    """Keep points at least `min_spacing_m` apart along the track, of near ones the best.
+    """Keep points at least `min_spacing_m` apart along the track; of close ones, keep the best.
 
-    The best has the least variance on the ground, of position and image point. Along the track
-    means along the way: a second pass over the same road has points of its own.
+    The best has the smallest variance on the ground, of position and image point together. The
+    distance is that driven, so that a second pass over the same road keeps points of its own.
     """
-    along = tracks_m(gcps, local_frame)
-    by_quality = sorted(along, key=lambda index: (_sd_on_ground(gcps[index], camera), index))
-    taken: list[float] = []
+    along = distances_along_track_m(gcps, local_frame)
+    by_quality = sorted(along, key=lambda index: (_sd_on_ground_m(gcps[index], camera), index))
+    kept_m: list[float] = []
     dropped = set()
     for index in by_quality:
-        place = bisect.bisect(taken, along[index])
-        beside = taken[max(0, place - 1) : place + 1]
-        if any(abs(other - along[index]) < min_spacing_m for other in beside):
+        place = bisect.bisect(kept_m, along[index])
+        neighbours_m = kept_m[max(0, place - 1) : place + 1]
+        if any(abs(other - along[index]) < min_spacing_m for other in neighbours_m):
             dropped.add(index)
         else:
-            taken.insert(place, along[index])
+            kept_m.insert(place, along[index])
     kept = tuple(point for index, point in enumerate(gcps) if index not in dropped)
-    lost = (gcps[index] for index in sorted(dropped))
+    close = (gcps[index] for index in sorted(dropped))
     return kept, tuple(
-        SkippedSighting(point.frame, point.target, SkipReason.CLOSE) for point in lost
+        SkippedSighting(point.frame, point.target, SkipReason.CLOSE) for point in close
     )
 
 
-def _sd_on_ground(point: Gcp, camera: Camera) -> float:
+def _sd_on_ground_m(point: Gcp, camera: Camera) -> float:
     of_image = longest_semi_axis(point.centre_cov_px2) * point.distance_m / camera.mean_focal_px
     return float(np.nan_to_num(np.hypot(longest_semi_axis(point.cov_m2), of_image), nan=np.inf))
 
 
-def tracks_m(gcps: Sequence[Gcp], local_frame: LocalFrame) -> Mapping[int, float]:
-    """Return for each moving point, by its index, how far along the vehicle's way it lies [m]."""
+def distances_along_track_m(gcps: Sequence[Gcp], local_frame: LocalFrame) -> Mapping[int, float]:
+    """Return the distance driven from the first to each moving point, by its index [m]."""
     order = sorted(
         (index for index, point in enumerate(gcps) if _moves(point)),
         key=lambda index: (gcps[index].time_s or 0.0, index),
@@ -269,21 +274,22 @@ def tracks_m(gcps: Sequence[Gcp], local_frame: LocalFrame) -> Mapping[int, float
 def set_checkpoints(gcps: Sequence[Gcp], local_frame: LocalFrame, share: float) -> tuple[Gcp, ...]:
     """Make a share of the moving points check points, evenly along the track.
 
-    They lie in the middle of as many equal pieces of the way; its first and last point, beyond
-    which nothing controls, stay control points.
+    The track is cut into as many equal pieces, and the point nearest to the middle of each becomes
+    a check point. The first and the last point stay control points, because nothing beyond them
+    would control the ends.
     """
-    along = tracks_m(gcps, local_frame)
+    along = distances_along_track_m(gcps, local_frame)
     inner = sorted(along, key=along.__getitem__)[1:-1]
     count = min(round(share * len(along)), len(inner))
     if not count:
         return tuple(gcps)
     length = max(along.values())
-    free = np.array([along[index] for index in inner])
+    unused = np.array([along[index] for index in inner])
     chosen = set()
     for piece in range(count):
-        nearest = int(np.argmin(np.abs(free - (piece + 0.5) / count * length)))
+        nearest = int(np.argmin(np.abs(unused - (piece + 0.5) / count * length)))
         chosen.add(inner[nearest])
-        free[nearest] = np.inf
+        unused[nearest] = np.inf
     return tuple(replace(point, is_checkpoint=index in chosen) for index, point in enumerate(gcps))
 
 

@@ -1,4 +1,4 @@
-"""One measured target: the part of the measurement that its place on the ground needs."""
+"""One measured target: the part of the measurement that georeferencing needs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.records import CircleImage, Measurement
 
-_NO_HEADING_RAD2 = 1.0  # variance from which on an angle is not known
+_MAX_HEADING_VARIANCE_RAD2 = 1.0  # with a larger one, the heading counts as unknown
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,72 +25,75 @@ class Sighting:
     centre_cov_px2: FloatArray | None  # (2, 2): its covariance [px²]
     distance_m: float  # projection centre to target centre [m]
     sd_distance_m: float | None  # its standard deviation [m]
-    # share of calibration and diameter: one error in all frames, not in `sd_distance_m` [m]
+    # share of calibration and diameter [m]: an error that all frames share, not included in
+    # `sd_distance_m`
     sd_common_distance_m: float | None
     pose: Pose | None = None  # target → camera; None: not measured
     # (6, 6): its covariance: translation [m], left rotation vector in the camera frame [rad]
     pose_cov: FloatArray | None = None
     score: float | None = None  # normalised cross-correlation of the code
     ambiguity: float | None = None  # Δχ² by which the circle's other pose is worse
-    # (6, 6): share of calibration and diameter, not in `pose_cov`; None: not known
+    # (6, 6): share of calibration and diameter, not included in `pose_cov`; None: not known
     common_pose_cov: FloatArray | None = None
     image: CircleImage | None = None  # of a plain target's outer circle, without any prior
 
     @property
     def has_heading(self) -> bool:
-        """Whether it is known how the target is turned in its plane: a plain disc has no mark."""
+        """Whether the target's rotation in its plane is known; a plain disc shows none."""
         if self.pose is None or self.pose_cov is None:
             return False
         normal = self.pose.normal
-        return bool(normal @ self.pose_cov[3:, 3:] @ normal < _NO_HEADING_RAD2)
+        return bool(normal @ self.pose_cov[3:, 3:] @ normal < _MAX_HEADING_VARIANCE_RAD2)
 
     def row_time_s(self, camera: Camera) -> float | None:
         """Return when the centre's row was exposed, Unix UTC [s].
 
-        A rolling shutter reads from the first to the last row in `camera.readout_s`, and the
-        middle row at the frame's time.
+        A rolling shutter reads from the first to the last row in `camera.readout_s`; the frame's
+        time is that of the middle row.
         """
         if self.time_s is None:
             return None
         return self.time_s + self.rows_since_middle(camera) * camera.readout_s
 
     def rows_since_middle(self, camera: Camera) -> float:
-        """Return how far below the middle row the centre lies, in frames: -0.5 … 0.5 inside."""
+        """Return how far below the middle row the centre is, in frame heights; inside ±0.5."""
         return float(camera.rows_since_middle(self.centre_px[None])[0])
 
 
-def sighting_of(frame: str, number: int, time_s: float | None, seen: Measurement) -> Sighting:
-    """Return the part of a measurement that its place on the ground needs.
+def sighting_of(
+    frame: str, number: int, time_s: float | None, measurement: Measurement
+) -> Sighting:
+    """Return the part of a measurement that georeferencing needs.
 
     Parameters
     ----------
     number : int
-        Of the frame among all frames of the flight, from 1.
+        Position of the frame among all frames of the flight, from 1.
     """
-    own, common = seen.uncertainty, seen.common
+    own, common = measurement.uncertainty, measurement.common
     return Sighting(
         frame=frame,
         number=number,
-        target=seen.target,
-        instance=seen.instance,
+        target=measurement.target,
+        instance=measurement.instance,
         time_s=time_s,
-        centre_px=seen.centre_px,
+        centre_px=measurement.centre_px,
         centre_cov_px2=None if own is None else own.centre_cov_px2,
-        distance_m=seen.distance_m,
+        distance_m=measurement.distance_m,
         sd_distance_m=None if own is None else own.sd_distance_m,
         sd_common_distance_m=None if common is None else common.sd_distance_m,
-        pose=seen.pose,
+        pose=measurement.pose,
         pose_cov=None if own is None else own.pose_cov,
-        score=seen.score,
-        ambiguity=None if seen.alternative is None else seen.alternative.ambiguity,
+        score=measurement.score,
+        ambiguity=None if measurement.alternative is None else measurement.alternative.ambiguity,
         common_pose_cov=None if common is None else common.pose_cov,
-        image=seen.image,
+        image=measurement.image,
     )
 
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """What may displace edges, named as the columns of the detections; None is null."""
+    """What may displace edges, named as the columns of the detections; None: null there."""
 
     radius_px: float | None
     blur_px: float | None
@@ -105,7 +108,7 @@ class Exposure:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attempt:
-    """One target looked for in one readable frame."""
+    """The search for one target in one readable frame, with its result."""
 
     # as in the detections
     frame: str

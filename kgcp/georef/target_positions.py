@@ -1,4 +1,4 @@
-"""Positions of targets over time: carried by the vehicle, or standing still."""
+"""Positions of targets over time: on the vehicle, or static."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from kgcp.targets.plain import AnyTarget, PlainTarget
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VehicleState:
-    """Motion of the vehicle while a target was at its place."""
+    """Motion of the vehicle at the time of a target's position."""
 
     velocity_m_s: FloatArray  # (3,): of the target's centre, in the ENU frame [m/s]
     frame_from_body: FloatArray  # (3, 3): the vehicle's body axes in the ENU frame, as columns
@@ -35,15 +35,16 @@ class TargetPosition:
     """Position of a target's centre."""
 
     position_m: FloatArray  # (3,): in the ENU frame [m]
-    # (3, 3): covariance in ENU axes [m²]; None where the trajectory has no standard deviations
+    # (3, 3): covariance in ENU axes [m²]; None: trajectory or static target have no standard
+    # deviations
     cov_m2: FloatArray | None
-    # (3, 4): how one standard deviation of lever arm x, y, z and of the synchronisation moves the
-    # place, ENU axes, as columns [m]. These four errors are the same in all frames; between the
-    # places i and j they make the covariance C_i C_jᵀ. None: the target stands still.
+    # (3, 4): displacements of the position by one standard deviation of lever arm x, y, z and of
+    # the synchronisation, ENU axes, as columns [m]. These four errors are the same in all frames.
+    # The covariance that they cause between positions i and j is C_i C_jᵀ. None: static target
     common_m: FloatArray | None = None
-    vehicle_state: VehicleState | None = None  # None: the target stands still
-    # (3, 3): share of `cov_m2` by the interpolation between the trajectory's epochs, which does not
-    # last beyond these [m²]; None as `cov_m2`, or the target stands still
+    vehicle_state: VehicleState | None = None  # None: static target
+    # (3, 3): share of `cov_m2` by the interpolation between the trajectory's epochs [m²]. This
+    # error ends at the epochs. None: `cov_m2` is None, or static target
     interpolation_m2: FloatArray | None = None
 
 
@@ -57,7 +58,7 @@ class Vehicle:
 
     @classmethod
     def on(cls, trajectory: Trajectory, settings: VehicleSettings, local_frame: LocalFrame) -> Self:
-        """Bring a trajectory from the map into the ENU frame."""
+        """Transform a trajectory from the map into the ENU frame."""
         position = local_frame.enu_from_map(trajectory.position_map)
         frame_from_ned = local_frame.level_rotations(position) @ ENU_FROM_NED
         motion = Motion(
@@ -77,10 +78,10 @@ class Vehicle:
     def positions(self, time_s: FloatArray) -> list[TargetPosition]:
         """Return the target's positions at frame times (n,) that the trajectory covers.
 
-        position = trajectory point + R(frame ← body) · lever arm. The covariance adds up, with
-        first-order propagation: trajectory, attitude times lever arm, the interpolation of both,
-        lever arm, and the target's velocity times the synchronisation. Attitude deviations that
-        the file lacks count as zero.
+        position = trajectory point + R(frame ← body) · lever arm. The covariance is, to first
+        order, the sum of the shares of the trajectory, of attitude times lever arm, of the
+        interpolation of both, of the lever arm, and of the target's velocity times the
+        synchronisation. Attitudes without standard deviations count as exact.
         """
         trajectory_s = time_s + self.settings.time_offset_s
         states = self.motion.states(trajectory_s)
@@ -88,19 +89,19 @@ class Vehicle:
         velocity = states.velocity_m_s + np.cross(states.angular_velocity_rad_s, lever)
         common = self._common_effects(states.frame_from_body, velocity)
         cov: Sequence[FloatArray | None] = [None] * len(time_s)
-        between: Sequence[FloatArray | None] = cov
+        interpolation: Sequence[FloatArray | None] = cov
         if states.sd_position_m is not None:
             own = self._trajectory_cov(states, states.sd_position_m)
             own = own + self._attitude_cov(states, lever)
-            between_m2 = self._interpolation_cov(trajectory_s, lever)
-            cov = list(own + between_m2 + common @ np.swapaxes(common, 1, 2))
-            between = list(between_m2)
+            interpolation_m2 = self._interpolation_cov(trajectory_s, lever)
+            cov = list(own + interpolation_m2 + common @ np.swapaxes(common, 1, 2))
+            interpolation = list(interpolation_m2)
         vehicle_states = map(VehicleState, velocity, states.frame_from_body)
-        places = states.position_m + lever
-        return list(map(TargetPosition, places, cov, common, vehicle_states, between))
+        positions = states.position_m + lever
+        return list(map(TargetPosition, positions, cov, common, vehicle_states, interpolation))
 
     def _trajectory_cov(self, states: States, sd_position_m: FloatArray) -> FloatArray:
-        """Return the share (n, 3, 3) of the trajectory point, whose deviations are in map axes."""
+        """Return the share (n, 3, 3) of the trajectory point, rotated from map to ENU axes."""
         axes = self.local_frame.grid_rotation(states.position_m)
         if states.cov_position_m2 is None:
             return covariance_along(axes, sd_position_m)
@@ -116,7 +117,7 @@ class Vehicle:
         return covariance_along(effects, np.radians(states.sd_attitude_deg))
 
     def _interpolation_cov(self, trajectory_s: FloatArray, lever: FloatArray) -> FloatArray:
-        """Return the share (n, 3, 3) of what lies between the trajectory's epochs."""
+        """Return the share (n, 3, 3) of the interpolation between the trajectory's epochs."""
         errors = interpolation_errors(self.motion, trajectory_s)
         arm = cross_matrix(lever)
         return np.asarray(
@@ -124,7 +125,7 @@ class Vehicle:
         )
 
     def _common_effects(self, frame_from_body: FloatArray, velocity_m_s: FloatArray) -> FloatArray:
-        """Return what `TargetPosition.common_m` holds, (n, 3, 4)."""
+        """Return `TargetPosition.common_m` of n positions (n, 3, 4)."""
         arm = frame_from_body * np.array(self.settings.sd_lever_arm_m)
         shift = velocity_m_s * self.settings.sd_time_s
         return np.concatenate((arm, shift[:, :, None]), axis=2)
@@ -143,9 +144,9 @@ class NoPosition(StrEnum):
 class TargetPositions:
     """Positions of all targets of a flight at any time."""
 
-    local_frame: LocalFrame  # the flight's map, and the ENU frame of all places
-    static: Mapping[str, TargetPosition]  # targets that stand still, by name
-    vehicle: Vehicle | None  # the vehicle that carries the other one
+    local_frame: LocalFrame  # the flight's map, and the ENU frame of all positions
+    static: Mapping[str, TargetPosition]  # of static targets, by name
+    vehicle: Vehicle | None  # which carries the one moving target
 
     @classmethod
     def of(
@@ -155,12 +156,15 @@ class TargetPositions:
         trajectory: Trajectory | None,
         settings: VehicleSettings,
     ) -> Self:
-        """Prepare the flight's targets, in an ENU frame over the first position that is known.
+        """Prepare the flight's targets.
+
+        The ENU frame has its origin at the trajectory's first position, or at that of the first
+        static target.
 
         Raises
         ------
         KgcpError
-            If no target has a position, of its own or by a trajectory, or the CRS is unusable.
+            If there is neither a static target nor a trajectory, or if the CRS is unusable.
         """
         known = [np.array(target.position_m) for target in targets if target.position_m is not None]
         if trajectory is not None:
@@ -182,15 +186,15 @@ class TargetPositions:
         Raises
         ------
         KgcpError
-            If a moving target has no vehicle, two targets would ride on its one lever arm, no
-            frame has a time, or none of the times lies within the trajectory.
+            If a moving target has no vehicle, if two moving targets would share the vehicle's lever
+            arm, if no frame has a time, or if no time lies within the trajectory.
         """
-        found: list[TargetPosition | NoPosition] = [
+        positions: list[TargetPosition | NoPosition] = [
             self.static.get(target, NoPosition.NO_TIME) for target in targets
         ]
         moving = [index for index, target in enumerate(targets) if target not in self.static]
         if not moving:
-            return found
+            return positions
         vehicle = self._vehicle_of(sorted({targets[index] for index in moving}))
         timed = [(index, time) for index in moving if (time := time_s[index]) is not None]
         if not timed:
@@ -202,8 +206,8 @@ class TargetPositions:
         for index, position in zip(
             indices, _moving_positions(vehicle, [t for _, t in timed]), strict=True
         ):
-            found[index] = position
-        return found
+            positions[index] = position
+        return positions
 
     def _vehicle_of(self, moving: Sequence[str]) -> Vehicle:
         names = " and ".join(repr(name) for name in moving)
@@ -215,7 +219,7 @@ class TargetPositions:
         if len(moving) > 1:
             raise KgcpError(
                 f"flight.toml: targets {names} share one lever_arm_m; give position_m to those"
-                " that stand still and leave out those that are not to be used"
+                " that are static, and remove those that are not to be used"
             )
         return self.vehicle
 
@@ -223,7 +227,7 @@ class TargetPositions:
 def _moving_positions(
     vehicle: Vehicle, time_s: Sequence[float]
 ) -> list[TargetPosition | NoPosition]:
-    """Return the target's positions on the vehicle at frame times, or why it is unknown."""
+    """Return the positions of the target on the vehicle at frame times, or why they are unknown."""
     times = np.array(time_s)
     coverage = vehicle.coverage(times)
     inside = np.array([kind is Coverage.INSIDE for kind in coverage])
@@ -267,9 +271,10 @@ def _static_positions(
 def static_position(
     position_map: tuple[float, float, float], target: AnyTarget, local_frame: LocalFrame
 ) -> TargetPosition:
-    """Return the place of the centre of a target's face, from its stated position.
+    """Return the position of the centre of a target's face, from its stated position.
 
-    Its covariance is not known if no standard deviation is stated.
+    The face of a plain target is its thickness above the stated position. The covariance is unknown
+    if no standard deviation is stated.
     """
     position = local_frame.enu_from_map(np.array([position_map]))[0]
     axes = local_frame.grid_rotation(position)
@@ -278,7 +283,7 @@ def static_position(
     if isinstance(target, PlainTarget) and target.thickness_m and target.normal_enu is not None:
         level = local_frame.level_rotations(position[None])[0]
         normal = level @ np.array(target.normal_enu)
-        aside_m = target.thickness_m * math.radians(target.sd_normal_deg)
+        sd_across_m = target.thickness_m * math.radians(target.sd_normal_deg)
         position = position + target.thickness_m * normal
-        cov = cov + aside_m**2 * (np.eye(3) - np.outer(normal, normal))
+        cov = cov + sd_across_m**2 * (np.eye(3) - np.outer(normal, normal))
     return TargetPosition(position, cov if is_cov_known else None)

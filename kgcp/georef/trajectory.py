@@ -18,11 +18,14 @@ from kgcp.georef.local_frame import LocalFrame, level_axes_ecef
 
 ENU_FROM_NED: FloatArray = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
+# An interval is a gap if it is longer than both: this time, and so many medians of the interval.
 _MIN_GAP_S = 0.5
 _GAP_INTERVALS = 1.5
-_EVEN_RATIO = 2.5  # of two steps of a spline, beyond which noise over the shorter one bends it
-_HALF_BASE_S = 0.25  # of a course: one step of a fast logger is all noise
-_MIN_SPEED_M_S = 0.5  # slower, the noise of positions turns the course
+# Largest ratio of neighbouring steps of a spline. Beyond it, noise over the shorter step bends the
+# spline in the longer one.
+_MAX_STEP_RATIO = 2.5
+_HALF_BASE_S = 0.25  # of a course: over one interval of a fast logger it would be mere noise
+_MIN_SPEED_M_S = 0.5  # below, the course is dominated by the noise of positions
 
 
 def body_to_ned(roll_deg: FloatArray, pitch_deg: FloatArray, heading_deg: FloatArray) -> FloatArray:
@@ -43,23 +46,23 @@ def roll_pitch_heading_deg(body_in_ned: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """A vehicle's trajectory as its file gives it: map positions, angles against true north."""
+    """A vehicle's trajectory as given by its file: map positions, heading from true north."""
 
     time_s: FloatArray  # (n,): Unix time, UTC, strictly ascending, n ≥ 2 [s]
     position_map: FloatArray  # (n, 3): x, y, z in the flight's CRS
-    # (n, 3): roll, pitch, heading against the local level and true north [deg]
+    # (n, 3): roll, pitch and heading relative to the local horizontal and true north [deg]
     attitude_deg: FloatArray
     # (n, 3): standard deviations along the map's axes [m]; None: the file has none
     sd_position_m: FloatArray | None
     # (n, 3): of roll, pitch, heading [deg]; None: the file has none
     sd_attitude_deg: FloatArray | None
-    # (n, 3, 3): covariances along the map's axes [m²], of which `sd_position_m` is the diagonal;
-    # None: the file tells no more than standard deviations
+    # (n, 3, 3): covariances along the map's axes [m²], whose diagonals are the squares of
+    # `sd_position_m`; None: the file has standard deviations at most
     cov_position_m2: FloatArray | None = None
 
 
 class Coverage(StrEnum):
-    """Whether a trajectory can say where the vehicle was at some time."""
+    """Whether a trajectory can be interpolated at a time."""
 
     INSIDE = "inside"
     BEFORE = "before_trajectory"
@@ -96,9 +99,9 @@ class Motion:
 
     @property
     def max_gap_s(self) -> float:
-        """Longest interval that is interpolated: 0.5 s, or 1.5 of a slow logger's intervals [s].
+        """Longest interval that is interpolated [s]: 0.5 s, or 1.5 usual intervals if longer.
 
-        Over half a second a car's position is cubic to within a few millimetres.
+        Over half a second, the path of a car deviates from a cubic by a few millimetres only.
         """
         return max(_MIN_GAP_S, _GAP_INTERVALS * float(np.median(np.diff(self.time_s))))
 
@@ -116,14 +119,14 @@ class Motion:
     def states(self, time_s: FloatArray) -> States:
         """Interpolate at times (m,) that `coverage` reports to be inside.
 
-        Positions follow a cubic spline, separately between gaps, because a turning car leaves
-        a straight chord by v²/R·h²/8: 6 mm at 10 Hz, 0.6 m at 1 Hz (10 m/s, R = 20 m). The spline
-        is within 0.01 mm of that circle at 10 Hz and 4 mm at 1 Hz, but 35 mm in the first and last
-        interval. It leaves out samples that follow others closely, because it would turn noise over
-        the short intervals into waves over the long ones. Their distances from the spline are
-        interpolated along straight lines, so that the path goes through all samples. Attitudes turn
-        about a fixed axis between two samples (slerp). Standard deviations are those of the
-        samples; `interpolation_errors` has what interpolation adds.
+        Positions follow a cubic spline, separately between gaps. A straight chord would not do: a
+        turning car leaves it by v²/R·h²/8, which is 6 mm at 10 Hz and 0.6 m at 1 Hz (10 m/s,
+        R = 20 m). The spline deviates from that circle by 0.01 mm at 10 Hz and by 4 mm at 1 Hz, but
+        by 35 mm in the first and last interval. Samples that follow others closely are not knots of
+        the spline, because noise over a short interval would become waves over a long one. Their
+        offsets from the spline are interpolated linearly and added, so that the path goes through
+        all samples. Attitudes turn about a fixed axis between two samples (slerp). Standard
+        deviations are those of the samples; `interpolation_errors` returns what interpolation adds.
         """
         left, fraction = self.place(time_s)
         position, velocity = self._positions(time_s, left, fraction)
@@ -149,9 +152,10 @@ class Motion:
         return np.split(np.arange(len(self.time_s)), breaks)
 
     def _left(self, time_s: FloatArray) -> IndexArray:
-        """Return the index of the sample that begins each time's interval.
+        """Return the index of the sample at the start of each time's interval.
 
-        The sample before a gap ends the interval before it: what moved across the gap is not known.
+        A time exactly at the sample before a gap belongs to the interval before it, because the
+        motion across the gap is unknown.
         """
         after = np.searchsorted(self.time_s, time_s, side="right")
         left = np.clip(after - 1, 0, len(self.time_s) - 2)
@@ -172,12 +176,12 @@ class Motion:
             if not chosen.any():
                 continue
             since, samples = self.time_s[run] - self.time_s[run[0]], self.position_m[run]
-            knots = spread_samples(since)
+            knots = spline_knots(since)
             spline = CubicSpline(since[knots], samples[knots])
-            beside = samples - spline(since)  # 0 at the knots
+            offsets = samples - spline(since)  # 0 at the knots
             wanted = time_s[chosen] - self.time_s[run[0]]
-            nearby = _interpolated(beside, left[chosen] - run[0], fraction[chosen])
-            position[chosen], velocity[chosen] = spline(wanted) + nearby, spline(wanted, 1)
+            offset = _interpolated(offsets, left[chosen] - run[0], fraction[chosen])
+            position[chosen], velocity[chosen] = spline(wanted) + offset, spline(wanted, 1)
         return position, velocity
 
     def _attitudes(self, left: IndexArray, fraction: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -188,24 +192,26 @@ class Motion:
         return attitude.as_matrix(), turn / np.diff(self.time_s)[left, None]
 
 
-def spread_samples(time_s: FloatArray) -> IndexArray:
-    """Return which of n ≥ 2 samples a spline goes through: the ends, and none too close to another.
+def spline_knots(time_s: FloatArray) -> IndexArray:
+    """Return which of n ≥ 2 samples are knots of a spline: the ends, and no two too close.
 
-    Beside a long step, the next one may be shorter by `_EVEN_RATIO`. Farther away from it, steps
-    may be shorter still, in proportion to the time.
+    The step next to a long one may be shorter by a factor of `_MAX_STEP_RATIO`. Farther from it,
+    steps may be shorter still, in proportion to the time.
     """
     steps = np.diff(time_s)
-    # (n - 1,): the longest step, less the time from it, at the samples after and before steps
+    # (n - 1,): largest length of a step minus the time from it, at the samples after and before
+    # the steps
     after = np.maximum.accumulate(steps + time_s[1:]) - time_s[1:]
     before = np.maximum.accumulate((steps - time_s[:-1])[::-1])[::-1] + time_s[:-1]
-    least = np.maximum(after[:-1], before[1:]) / _EVEN_RATIO  # (n - 2,): of the inner samples
+    # (n - 2,): least step before the inner samples
+    least = np.maximum(after[:-1], before[1:]) / _MAX_STEP_RATIO
     is_knot = np.ones(len(time_s), dtype=bool)
     last = 0
     for sample in (np.flatnonzero(steps[:-1] < least) + 1).tolist():
         last = sample - 1 if is_knot[sample - 1] else last
         is_knot[sample] = time_s[sample] - time_s[last] >= least[sample - 1]
-    last = int(np.flatnonzero(is_knot[:-1])[-1])  # it gives way to the end of the run
-    is_knot[last] = last == 0 or time_s[-1] - time_s[last] >= after[-1] / _EVEN_RATIO
+    last = int(np.flatnonzero(is_knot[:-1])[-1])  # no knot if it is too close to the end of the run
+    is_knot[last] = last == 0 or time_s[-1] - time_s[last] >= after[-1] / _MAX_STEP_RATIO
     return np.flatnonzero(is_knot)
 
 
@@ -226,14 +232,15 @@ def attitude_from_course(
 ) -> FloatArray:
     """Return roll = pitch = 0 and the course over ground as heading (n, 3) [deg].
 
-    The course is that of the chord from 0.25 s (or one usual interval, if that is longer) before
-    an epoch to as much after it, which is the tangent of a steady curve. While the vehicle
-    stands it keeps its last course; before it first moves it has that of its first move.
+    The course is the direction of a chord, which in a steady curve is that of the tangent. The
+    chord extends from 0.25 s before an epoch to 0.25 s after it, or over one usual interval on
+    either side if that is longer. A standing vehicle keeps its last course; before it first moves,
+    it has that of its first movement.
 
     Raises
     ------
     KgcpError
-        If it never moves.
+        If the vehicle never moves.
     """
     local_frame = LocalFrame.at(crs, position[0])
     enu = local_frame.enu_from_map(position)

@@ -1,4 +1,4 @@
-"""Unix seconds as dates of any year, on every system."""
+"""Unix seconds as dates, on every system and for any year."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 def date_of(unix_s: float) -> datetime:
     """Return Unix seconds as a UTC date, rounded to the microsecond.
 
-    `datetime.fromtimestamp` refuses seconds before 1970 on Windows, as frames have them whose times
-    count from the start of a flight.
+    `datetime.fromtimestamp` refuses times before 1970 on Windows. Frames have such times if these
+    count from the start of the flight.
     """
     return EPOCH + timedelta(microseconds=round(unix_s * 1e6))

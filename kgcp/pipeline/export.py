@@ -13,7 +13,7 @@ from kgcp.errors import KgcpError
 from kgcp.georef.camera_priors import CameraPrior, camera_priors
 from kgcp.georef.gcp import Gcp, SkippedSighting, build_gcps, transform_gcps
 from kgcp.georef.local_frame import CrsTransform
-from kgcp.georef.selection import Selection, explain_none_left, leave_out, select
+from kgcp.georef.selection import Selection, exclude, explain_empty_selection, select
 from kgcp.georef.sighting import Attempt, Sighting
 from kgcp.georef.target_positions import Vehicle
 from kgcp.io.exporters.formats import DEFAULT_FORMATS, FORMATS
@@ -113,7 +113,7 @@ def make_gcps(
     local_frame = target_positions.local_frame
     gcps, unwanted = select(placed, sightings, local_frame, flight.camera, selection)
     if placed and not gcps:
-        raise KgcpError(explain_none_left(placed, unwanted, selection))
+        raise KgcpError(explain_empty_selection(placed, unwanted, selection))
     consistency, doubts = inputs.compared(sightings)
     if crs is not None and gcps:
         transform = CrsTransform.to(crs, local_frame, np.asarray(gcps[0].position_map))
@@ -152,7 +152,7 @@ def _sightings(
             f"{table}: no target was measured in any frame;"
             " see the reasons that 'kgcp detect' gives"
         )
-    sightings, excluded = leave_out(measured, selection.excluded)
+    sightings, excluded = exclude(measured, selection.excluded)
     if not sightings:
         raise KgcpError(f"{table}: all {len(measured)} sightings are excluded; exclude fewer")
     return sightings, excluded

@@ -16,7 +16,7 @@ from kgcp.georef.plate_priors import CameraAttitudes, normal_priors
 from kgcp.georef.scene_rotation import (
     CameraMotions,
     camera_motions,
-    combine,
+    combine_with_prior,
     rotations_between_frames,
 )
 from kgcp.georef.sighting import Attempt
@@ -102,7 +102,9 @@ def _with_rates(
     for row, frame in enumerate(frames):
         if frame in rates:
             velocity = np.array(rates[frame].velocity_rad_s)
-            rotations[row] = combine(velocity, rates[frame].sd_rad_s, rotations.get(row, unknown))
+            rotations[row] = combine_with_prior(
+                velocity, rates[frame].sd_rad_s, rotations.get(row, unknown)
+            )
     return rotations
 
 

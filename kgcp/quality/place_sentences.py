@@ -135,7 +135,7 @@ def noise_sentence(placement: Placement) -> str:
 
 def motion_sentence(motions: CameraMotions | None, camera: Camera) -> str:
     """Return that nothing tells a rolling shutter's motion; empty: it is told, or there is none."""
-    if motions is None or motions.is_seen.any():
+    if motions is None or motions.is_observed.any():
         return ""
     return (
         "poses and times do not tell how the camera moves while its rolling shutter reads a"

@@ -172,7 +172,7 @@ def test_a_static_target_of_two_flights_is_one_point(
     assert points["frame"].is_unique
     two[1].edit(("689500.0", "689501.0"))
     line = error_of(*arguments)
-    assert f"target 'A' stands at different places in north/{FRAMES[0]} and south_bank/" in line
+    assert f"static target 'A' has different positions in north/{FRAMES[0]} and south_bank/" in line
 
 
 def test_flights_of_two_cameras_are_merged_where_files_hold_none(

@@ -170,7 +170,7 @@ def rewrite_times(path: Path, clock: Callable[[float], str]) -> None:
         ),
         (
             lambda gps: f"{gps:.6f}",
-            "the trajectory's times count from 1980-01-06, as GPS does: add",
+            "the trajectory's times count from 1980-01-06, as GPS does: to make",
         ),
         (
             lambda gps: f"{gps // _WEEK_S:.0f} {gps % _WEEK_S:.6f}",
@@ -198,7 +198,7 @@ def test_a_selection_that_leaves_nothing_tells_the_best(measured: SampleFlight) 
     line = measured.fails("export-gcp", "--max-sd", "0.001")
     assert re.search(
         r"no points left after selection: 4 uncertain of 4; the best standard deviation is"
-        r" 0\.01\d+ m; select less strictly",
+        r" 0\.01\d+ m; relax the limits",
         line,
     )
     assert "the best score is 0.9" in measured.fails("export-gcp", "--min-score", "1.0")

@@ -155,7 +155,7 @@ TRAJECTORIES: Mapping[str, tuple[str | bytes, str]] = {
     "a trajectory to the centre": (VEHICLE.replace("545.0", "-6378000"), "; "),
     "a trajectory far off the map": (
         VEHICLE.replace("689591.0", "1e14", 1),
-        "cannot hold the point",
+        "does not cover the point",
     ),
     "a trajectory unsorted": (VEHICLE.replace(":02Z", ":00.5Z"), "lies before"),
     "a trajectory with a time twice": (VEHICLE.replace(":02Z", ":01Z"), "repeats"),

@@ -62,7 +62,7 @@ def test_moving_points_are_named_by_frame_and_static_ones_by_target() -> None:
 def test_a_static_target_named_like_a_moving_point_is_refused() -> None:
     """Packages would take both for one point."""
     whereabouts = _whereabouts(VehicleSettings(), static="K0003")
-    with pytest.raises(KgcpError, match=r"^'K0003' is a static target and the point of a moving"):
+    with pytest.raises(KgcpError, match=r"^'K0003' is both a static target and a point of"):
         build_gcps([_sighting(3, "A", 1.0), _sighting(7, "K0003", None)], whereabouts, _CAMERA)
     gcps, _ = build_gcps([_sighting(4, "A", 1.0), _sighting(7, "K0003", 1.0)], whereabouts, _CAMERA)
     assert [point.id for point in gcps] == ["K0004", "K0003"]

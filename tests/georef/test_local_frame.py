@@ -141,7 +141,7 @@ def test_heights_above_a_geoid_are_transformed_or_refused_but_never_taken_as_ell
 
 
 def test_coordinates_outside_the_projection_are_an_error() -> None:
-    with pytest.raises(KgcpError, match="cannot hold the point"):
+    with pytest.raises(KgcpError, match="does not cover the point"):
         LocalFrame.at("EPSG:25831", np.array([1e30, 0.0, 0.0]))
 
 

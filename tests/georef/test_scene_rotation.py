@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.scene_rotation import camera_motions, combine, rotations_between_frames
+from kgcp.georef.scene_rotation import camera_motions, combine_with_prior, rotations_between_frames
 from kgcp.measurement.plate_prior import SceneRotation
 
 A_PRIORI = SceneRotation((0.0, 0.0, 0.0), math.radians(5.0))
@@ -56,7 +56,7 @@ def test_few_frames_tell_nothing() -> None:
 
 
 def test_two_sources_are_weighted() -> None:
-    rotation = combine(np.array([0.1, 0.0, -0.2]), A_PRIORI.sd_rad_s, A_PRIORI)
+    rotation = combine_with_prior(np.array([0.1, 0.0, -0.2]), A_PRIORI.sd_rad_s, A_PRIORI)
     assert rotation.velocity_rad_s == pytest.approx((0.05, 0.0, -0.1))
     assert rotation.sd_rad_s == pytest.approx(A_PRIORI.sd_rad_s / math.sqrt(2.0))
 
@@ -74,13 +74,13 @@ def test_a_camera_s_shift_and_turn_are_found_between_its_poses() -> None:
     motions = camera_motions(time_s, centre_m[order], enu_from_camera[order], turns, 25.0)
     for row, place in enumerate(order):
         if 0 < place < 8:
-            assert motions.is_seen[row]
+            assert motions.is_observed[row]
             assert motions.velocity_m_s[row] == pytest.approx(velocity_m_s, rel=0.01)
             assert motions.sd_velocity_m_s[row] == pytest.approx(0.087, rel=0.05)
             assert motions.turn_rad_s[row] == pytest.approx(turn_rad_s, rel=0.05)
             assert motions.sd_turn_rad_s[row] == pytest.approx(math.radians(1.0), rel=0.05)
         else:
-            assert not motions.is_seen[row]
+            assert not motions.is_observed[row]
             assert not motions.velocity_m_s[row].any()
             assert motions.sd_velocity_m_s[row] == pytest.approx(25.0 * turns[row].sd_rad_s)
         if place == 0:  # the camera turns the other way than the scene

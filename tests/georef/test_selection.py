@@ -14,12 +14,12 @@ from kgcp.georef.gcp import Flag, Gcp, SkipReason
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.selection import (
     Selection,
+    apply_limits,
+    distances_along_track_m,
     flag_jumps,
-    pass_gates,
     select,
     set_checkpoints,
-    thin,
-    tracks_m,
+    thin_out,
 )
 from kgcp.georef.sighting import Sighting
 
@@ -103,11 +103,11 @@ def test_gates_hold_back_what_is_bad_and_what_is_not_known() -> None:
     ]
     gates = Selection(max_sd_m=0.08, min_score=0.95, min_ambiguity=9.0)
     for point, reason in cases:
-        kept, (skipped,) = pass_gates([point], gates)
+        kept, (skipped,) = apply_limits([point], gates)
         assert kept == ()
         assert skipped.reason is reason
-        assert pass_gates([point], Selection()) == ((point,), ())
-    assert pass_gates([good], gates) == ((good,), ())
+        assert apply_limits([point], Selection()) == ((point,), ())
+    assert apply_limits([good], gates) == ((good,), ())
 
 
 @given(
@@ -121,10 +121,10 @@ def test_thinned_points_keep_their_distance_and_no_gap_could_be_filled(
 ) -> None:
     sds = np.random.default_rng(seed).uniform(0.01, 0.1, len(along_m))
     points = [_point(i, s, float(sd)) for i, (s, sd) in enumerate(zip(along_m, sds, strict=True))]
-    kept, skipped = thin(points, _LOCAL_FRAME, _CAMERA, spacing_m)
+    kept, skipped = thin_out(points, _LOCAL_FRAME, _CAMERA, spacing_m)
     ids = {point.id for point in kept}
     assert len(kept) + len(skipped) == len(points)
-    track = {points[i].id: s for i, s in tracks_m(points, _LOCAL_FRAME).items()}
+    track = {points[i].id: s for i, s in distances_along_track_m(points, _LOCAL_FRAME).items()}
     places = sorted(track[name] for name in ids)
     assert all(b - a >= spacing_m for a, b in pairwise(places))
     best = min(range(len(points)), key=lambda i: (sds[i], i))
@@ -139,7 +139,7 @@ def test_a_second_pass_of_the_same_road_is_not_thinned_away() -> None:
         replace(point, id=f"B{i}", frame=f"b{i}.jpg", time_s=2000.0 + i)
         for i, point in enumerate(reversed(there))
     )
-    kept, _ = thin((*there, *back), _LOCAL_FRAME, _CAMERA, 14.0)
+    kept, _ = thin_out((*there, *back), _LOCAL_FRAME, _CAMERA, 14.0)
     assert len(kept) == 19  # the turning point itself is seen twice
 
 
@@ -164,5 +164,5 @@ def test_checkpoints_are_spread_evenly_and_never_at_the_ends(
 
 def test_static_targets_are_neither_thinned_nor_checked() -> None:
     static = [replace(_point(i, 0.0), id="G", common_m=None) for i in range(5)]
-    assert thin(static, _LOCAL_FRAME, _CAMERA, 100.0) == (tuple(static), ())
+    assert thin_out(static, _LOCAL_FRAME, _CAMERA, 100.0) == (tuple(static), ())
     assert not any(point.is_checkpoint for point in set_checkpoints(static, _LOCAL_FRAME, 0.5))

@@ -141,7 +141,7 @@ def test_deviations_of_a_motion_that_nothing_tells_are_those_of_all_frames() -> 
         flight, time_s = strip(HEIGHT_M * math.radians(CAMERA.motion_sd_deg_s), rng)
         sightings = sightings_of(flight, time_s, rng)
         motions = motions_of(flight, np.full(FRAMES, math.nan))
-        assert not motions.is_seen.any()
+        assert not motions.is_observed.any()
         target = placed(flight, sightings, motions)
         z.append((target.position_map - flight.positions_map[0])[2] / target.sds[2])
     assert 0.7 < float(np.mean(np.abs(z))) < 1.3

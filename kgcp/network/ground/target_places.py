@@ -303,7 +303,7 @@ def _at_their_rows(
     effects[:, :3, :3] = sds_m[:, None, None] * views.world_from_camera
     effects[:, 3:, 3:] = sds_rad[:, None, None] * views.world_from_camera
     cov = effects @ np.swapaxes(effects, 1, 2)
-    is_common = ~motions.is_seen[at]
+    is_common = ~motions.is_observed[at]
     return replace(
         views,
         camera_m=views.camera_m + delay_s[:, None] * motions.velocity_m_s[at],

@@ -10,7 +10,7 @@ import numpy as np
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses, opk_from_rotation
-from kgcp.georef.crs import CRS_KEY, FARTHEST, geographic_of, parse_crs
+from kgcp.georef.crs import CRS_KEY, MAX_HEIGHT, geographic_of, parse_crs
 from kgcp.georef.local_frame import CrsTransform, LocalFrame
 from kgcp.io.files.safe_read import is_number
 from kgcp.io.files.sniff import ForeignFile
@@ -50,7 +50,7 @@ def on_the_map(
     if placed.crs is not None and not _is_same(placed.crs, crs):
         where = f"{file.path}: crs" if options.crs is None else REFERENCE_CRS
         placed = _moved(file, placed, LocalFrame.at(placed.crs, placed.position[0], where), crs)
-    high = np.flatnonzero(np.abs(placed.position[:, 2]) > FARTHEST)
+    high = np.flatnonzero(np.abs(placed.position[:, 2]) > MAX_HEIGHT)
     if high.size:
         raise file.error_at(
             f"pose of {source.names[high[0]]!r}",

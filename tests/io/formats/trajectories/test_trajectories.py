@@ -196,7 +196,9 @@ def test_a_crs_of_no_datum_has_no_exact_way(tmp_path: Path) -> None:
 def test_a_grid_that_is_not_installed_is_named(tmp_path: Path) -> None:
     rows = [f"{second},-1.5,52,100,1,2,3" for second in (0, 1)]
     path = _write(tmp_path, _HEADER, *rows)
-    with pytest.raises(KgcpError, match=r"vehicle.csv: the way .*EPSG:27700.* needs the grid") as e:
+    with pytest.raises(
+        KgcpError, match=r"vehicle.csv: the transformation .*EPSG:27700.* needs the grid"
+    ) as e:
         read_trajectory(path, "EPSG:27700", TrajectoryFileOptions(crs="EPSG:4258"))
     assert "\n" not in str(e.value)
     with pytest.raises(KgcpError, match=r"\[vehicle\] crs 'EPSG:0' cannot be used"):
@@ -220,7 +222,7 @@ def test_a_point_out_of_this_world_is_named(tmp_path: Path) -> None:
         )
     # easting and northing taken for Earth-centred coordinates lie a thousand kilometres deep
     grid = _write(tmp_path, _HEADER, "0,689586,5336250,547,1,2,3", "1,689587,5336250,547,1,2,3")
-    with pytest.raises(KgcpError, match=r"epoch 1 has no place .* which is 'EPSG:4978' now"):
+    with pytest.raises(KgcpError, match=r"epoch 1 cannot be transformed .* \(now 'EPSG:4978'\)"):
         read_trajectory(grid, _CRS, TrajectoryFileOptions(crs="EPSG:4978"))
 
 
