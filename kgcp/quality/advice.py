@@ -1,4 +1,4 @@
-"""What to change in flight.toml where vehicle and camera disagree, in words."""
+"""Sentences on what to change in flight.toml if vehicle and camera disagree."""
 
 from __future__ import annotations
 
@@ -10,38 +10,38 @@ from kgcp.quality.consistency import Consistency
 from kgcp.quality.corrections import Correction
 from kgcp.quality.number_text import amount
 
-_EXPLAINED = 2.0  # χ² over its degrees of freedom that corrections may leave
+_MAX_VARIANCE_FACTOR = 2.0  # after corrections that explain a disagreement
 _AXES = {"forward": 0, "right": 1, "down": 2}
 
 
 def advice(consistency: Consistency) -> tuple[str, ...]:
-    """Return one line per correction that is due; none where all is well.
+    """Return one line per correction that is due; none if vehicle and camera agree.
 
-    A correction is due where it is more than chance, and more than what flight.toml itself calls
-    uncertain. It is offered only if the corrections together explain the disagreement; otherwise
-    they mean nothing, and the line says so.
+    A correction is due if it is significant and larger than the standard deviation that flight.toml
+    states. It is offered only if the corrections together explain the disagreement. Otherwise they
+    mean nothing, and a single line says so.
     """
     if is_explained(consistency):
         return tuple(remedy for _, remedy in corrections(consistency))
     along, across, up = rms_m(consistency)
-    left = math.sqrt(consistency.estimate.variance_factor)
+    ratio = math.sqrt(consistency.estimate.variance_factor)
     line = (
         f"vehicle and camera differ by {along:.3f} m along, {across:.3f} m across and {up:.3f} m up"
-        " (RMS), which no correction of lever arm, time, readout or boresight explains:"
-        f" {left:.1f} times what the standard deviations say would be left"
+        " (RMS), and no correction of lever arm, time, readout or boresight explains it: even"
+        f" after corrections, residuals are {ratio:.1f} times their standard deviations"
     )
     return (line,)
 
 
 def is_explained(consistency: Consistency) -> bool:
-    """Tell whether the corrections, if any are due, explain the disagreement."""
+    """Tell whether credible corrections, or none at all, explain the disagreement."""
     due = [each for each in consistency.estimate.corrections if each.is_significant]
     is_credible = all(correction.is_credible for correction in due)
-    return is_credible and consistency.estimate.variance_factor <= _EXPLAINED
+    return is_credible and consistency.estimate.variance_factor <= _MAX_VARIANCE_FACTOR
 
 
 def corrections(consistency: Consistency) -> tuple[tuple[str, str], ...]:
-    """Return what differs, and the remedy, for each correction that is due."""
+    """Return the sentence on the disagreement and the remedy, for each correction that is due."""
     due = [
         correction
         for correction in consistency.estimate.corrections
@@ -53,11 +53,11 @@ def corrections(consistency: Consistency) -> tuple[tuple[str, str], ...]:
         f"vehicle and camera differ by {along:.3f} m along, {across:.3f} m across, {up:.3f} m up"
         " (RMS)"
     )
-    return tuple((sentence, _line(correction)) for correction in due)
+    return tuple((sentence, _remedy_with_condition(correction)) for correction in due)
 
 
 def rms_m(consistency: Consistency) -> tuple[float, float, float]:
-    """Return the RMS of the offsets along, across and up, outliers left out [m]."""
+    """Return the RMS of the offsets along, across and up, without outliers [m]."""
     kept = np.array(
         [
             discrepancy.offset_m
@@ -69,11 +69,11 @@ def rms_m(consistency: Consistency) -> tuple[float, float, float]:
     return along, across, up
 
 
-def _line(correction: Correction) -> str:
+def _remedy_with_condition(correction: Correction) -> str:
     text = _remedy(correction)
     if correction.tangled_with:
         others = " and ".join(correction.tangled_with)
-        text += f"; only if {others} is right: this flight cannot tell them apart"
+        text += f"; this flight cannot tell it apart from {others}, which must be right"
     return text
 
 
@@ -89,6 +89,6 @@ def _remedy(correction: Correction) -> str:
         return f"add {change} to [vehicle] lever_arm_m[{_AXES[axis]}] ({axis}) in flight.toml"
     axis = quantity.removeprefix("boresight_")
     return (
-        f"the images are turned by {change} about the camera's {axis} axis against the reference"
-        " poses: check that [reference] poses and [camera] are of the same adjustment"
+        "check that [reference] poses and [camera] come from the same adjustment: the images are"
+        f" rotated by {change} about the camera's {axis} axis relative to the reference poses"
     )

@@ -1,4 +1,4 @@
-"""What residuals of distances are made of: a scale, an offset, and what exposure does to edges."""
+"""Causes of the residuals of distances: a scale, an offset, and effects of exposure on edges."""
 
 from __future__ import annotations
 
@@ -10,59 +10,62 @@ from scipy.special import fdtrc
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.quality.exposure_effects import QUANTITIES, DistanceResiduals, varies
-from kgcp.quality.robust_gls import RegressionFit, fit, separable, two_sided
+from kgcp.quality.robust_gls import RegressionFit, fit, separable_unknowns, two_sided_probability
 
 SIGNIFICANT = 0.01
-"""Largest probability, corrected for the number of terms, of what is called significant."""
+"""Largest probability of a significant term, corrected for the number of terms."""
 
-MIN_COUNT = 6
-_PER_TERM = 4  # observations that every term of exposure must have
-_KNOWN_SHARE = 0.9  # of the frames that must have a quantity
-_MAX_INFLATION = 25.0  # of a term's variance by the others: a standard deviation five times larger
-_DISTANCE_LIKE = 1000.0  # the same of what grows with distance alone, and is always looked for
-_CURVED = "edge_curvature_px2"
+MIN_COUNT = 6  # residuals
+_MIN_PER_TERM = 4  # residuals per term, for effects of exposure
+_MIN_KNOWN_SHARE = 0.9  # of the frames in which a quantity must be known
+# Largest inflation of a term's variance by the other terms: standard deviations may be five times
+# larger than without them. The terms that depend on the distance only may be inflated more, because
+# they are always estimated.
+_MAX_INFLATION = 25.0
+_MAX_INFLATION_BY_DISTANCE = 1000.0
+_CURVATURE = "edge_curvature_px2"
 
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One cause, as far as residuals show it."""
+    """One cause with its estimated amount."""
 
     name: str  # `scale`, `offset_m`, `edge_curvature_px2`, or a column of the exposure
-    # estimate and standard deviation: of `scale` relative, of `offset_m` in metres, of
-    # `edge_curvature_px2` displacement of the edge times its radius [px²], of the others
-    # displacement of the edge in pixels per unit
+    # Estimate and standard deviation. `scale` is relative, `offset_m` in metres,
+    # `edge_curvature_px2` the displacement of the edge times its radius [px²]; the others are
+    # displacements of the edge in pixels per unit of their quantity.
     value: float
     sd: float
-    # of a value as large by chance (Student's t, both sides), by Holm's correction for the number
+    # of a value as large by chance (Student's t, two-sided), with Holm's correction for the number
     # of terms
     probability: float
 
     @property
     def is_significant(self) -> bool:
-        """Whether it is more than chance."""
+        """Whether it is unlikely to be chance."""
         return self.probability < SIGNIFICANT
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Regression:
-    """Residual = scale · distance + offset + what displaced edges do."""
+    """Fit of residual = scale · distance + offset + effects of displaced edges."""
 
     terms: tuple[Term, ...]  # `scale` first
-    # quantities that vary, but so much like others that they cannot be told from them
+    # quantities that vary together with others, so that their effects cannot be separated
     tangled: tuple[str, ...]
-    count: int  # residuals that took part
-    # (n,): rows that have all quantities; those of them that fit nothing and were left out
-    used: BoolArray
-    outlier: BoolArray
-    # of the residuals about a plain fit, over their stated deviations; 1 where these are true
+    count: int  # residuals that were fitted
+    used: BoolArray  # (n,): rows that have all quantities
+    outlier: BoolArray  # (n,): those of them that were left out as outliers
+    # standard deviation of the residuals about a plain fit, over the stated ones; 1 if these are
+    # right
     scatter: float
     correlation_s: float  # as in `RegressionFit`
-    # of the variance that scale and offset leave, what the terms of exposure explain, corrected for
-    # their number; 0 without any
+    # share of the variance after scale and offset that the terms of exposure explain, corrected
+    # for their number; 0 without such terms
     exposure_share: float
     # of as large a share by chance (F test); None without such terms
     exposure_probability: float | None
-    systematic_m: FloatArray  # (n,): what a plain fit finds, without the terms of exposure [m]
+    systematic_m: FloatArray  # (n,): the plain fit without its terms of exposure [m]
 
     @property
     def exposure_terms(self) -> tuple[Term, ...]:
@@ -72,33 +75,34 @@ class Regression:
 
     @property
     def is_exposure_significant(self) -> bool:
-        """Whether any effect of exposure is more than chance."""
+        """Whether any effect of exposure is significant."""
         return any(term.is_significant for term in self.exposure_terms)
 
 
 def regress(data: DistanceResiduals) -> Regression | None:
-    """Separate the causes of residuals; None for too few, or for distances that do not vary.
+    """Separate the causes of residuals; None if there are too few, or if distances do not vary.
 
-    Edges displaced by ε px change a distance by D ε / R, R being the ring's radius in px: which
-    with R ∝ 1/D grows with the square of the distance. So each exposure quantity x has the column
-    (x − mean) D / R, and δ, which is a displacement itself, δ D / R. Blur displaces curved edges
-    by σ² / 2R, so that D / R² is looked for last, and kept where it is significant.
+    An edge displaced by ε px changes the distance D by D ε / R, where R is the ring's radius in px.
+    Since R ∝ 1/D, this grows with the square of the distance. Each exposure quantity x therefore
+    has the column (x − mean) D / R. The edge shift δ is a displacement itself, and has the column
+    δ D / R. Blur displaces curved edges by σ² / 2R. Its column, D / R², is tried last, and kept if
+    it is significant.
     """
     if len(data.residual_m) < MIN_COUNT or not varies(data.residual_m):
         return None
     columns, used = _columns(data)
     weight = 1.0 / np.sqrt(data.errors.total)
-    names = _names_told_apart(columns, used, weight, int(np.count_nonzero(used)) // _PER_TERM)
+    names = _separable_names(columns, used, weight, int(np.count_nonzero(used)) // _MIN_PER_TERM)
     if "offset_m" not in names:
         return None
     tangled = tuple(name for name in columns if name not in names)
     result = _fit(data, columns, names, used)
-    curved = {**columns, _CURVED: data.distance_m / data.radius_px**2}
-    more = _names_told_apart(curved, used, weight, len(used))
-    if set(more) >= {*names, _CURVED} and used.sum() > _PER_TERM * (len(names) + 1):
-        other = _fit(data, curved, [*names, _CURVED], used)
-        if _terms([*names, _CURVED], other)[-1].is_significant:
-            names, columns, result = [*names, _CURVED], curved, other
+    extended = {**columns, _CURVATURE: data.distance_m / data.radius_px**2}
+    more = _separable_names(extended, used, weight, len(used))
+    if set(more) >= {*names, _CURVATURE} and used.sum() > _MIN_PER_TERM * (len(names) + 1):
+        other = _fit(data, extended, [*names, _CURVATURE], used)
+        if _terms([*names, _CURVATURE], other)[-1].is_significant:
+            names, columns, result = [*names, _CURVATURE], extended, other
     return _regression(data, columns, names, tangled, used, result)
 
 
@@ -110,7 +114,7 @@ def _columns(data: DistanceResiduals) -> tuple[dict[str, FloatArray], BoolArray]
     for quantity in QUANTITIES:
         values = quantity.measure(data.exposure[quantity.name])
         present = np.isfinite(values)
-        if present.mean() < _KNOWN_SHARE or not varies(values[present]):
+        if present.mean() < _MIN_KNOWN_SHARE or not varies(values[present]):
             continue
         used &= present
         zero = 0.0 if quantity.is_absolute else float(np.mean(values[present]))
@@ -118,15 +122,18 @@ def _columns(data: DistanceResiduals) -> tuple[dict[str, FloatArray], BoolArray]
     return columns, used
 
 
-def _names_told_apart(
-    columns: dict[str, FloatArray], used: BoolArray, weight: FloatArray, most: int
+def _separable_names(
+    columns: dict[str, FloatArray], used: BoolArray, weight: FloatArray, max_count: int
 ) -> list[str]:
-    """Return the names of the terms that can be told apart, at most so many."""
+    """Return the names of the terms that can be estimated together, `max_count` at most."""
     rows = np.column_stack(list(columns.values()))[used] * weight[used, None]
     names = list(columns)
-    limits = [_DISTANCE_LIKE if name in {"offset_m", _CURVED} else _MAX_INFLATION for name in names]
-    active, _ = separable(rows.T @ rows, np.flatnonzero(rows.any(axis=0)).tolist(), limits)
-    return [names[index] for index in active[: max(2, most)]]
+    limits = [
+        _MAX_INFLATION_BY_DISTANCE if name in {"offset_m", _CURVATURE} else _MAX_INFLATION
+        for name in names
+    ]
+    active, _ = separable_unknowns(rows.T @ rows, np.flatnonzero(rows.any(axis=0)).tolist(), limits)
+    return [names[index] for index in active[: max(2, max_count)]]
 
 
 def _fit(
@@ -138,7 +145,7 @@ def _fit(
 
 def _terms(names: Sequence[str], result: RegressionFit) -> tuple[Term, ...]:
     p_values = [
-        two_sided(float(value / sd), result.freedom)
+        two_sided_probability(float(value / sd), result.freedom)
         for value, sd in zip(result.values, result.sds, strict=True)
     ]
     return tuple(
@@ -168,11 +175,11 @@ def _regression(
     used: BoolArray,
     result: RegressionFit,
 ) -> Regression:
-    """Return a fit by its terms, with what of it they and exposure explain.
+    """Describe a fit: its terms, its scatter, and what exposure explains.
 
-    Errors that last longer than the flight are an offset themselves, and the fit leaves open which
-    is which: its values may lie beside all residuals, within standard deviations that say so. What
-    residuals have in common, and how they scatter about it, is therefore that of a plain fit.
+    An error that lasts longer than the flight acts like an offset, and the fit cannot separate the
+    two. Its values may therefore be far from all residuals, as its standard deviations show. For
+    this reason `systematic_m` and `scatter` come from a plain fit.
     """
     outlier = np.zeros(len(used), dtype=bool)
     outlier[used] = result.outlier
@@ -196,7 +203,7 @@ def _regression(
 
 
 def _plain_fit(data: DistanceResiduals, design: FloatArray, chosen: BoolArray) -> FloatArray:
-    """Return the values (p,) by weights alone, as if no error lasted."""
+    """Return the values (p,) of a weighted fit that takes all errors as independent."""
     weight = 1.0 / np.sqrt(data.errors.total[chosen])
     rows = design[chosen] * weight[:, None]
     size = np.linalg.norm(rows, axis=0)
@@ -205,7 +212,7 @@ def _plain_fit(data: DistanceResiduals, design: FloatArray, chosen: BoolArray) -
 
 
 def _without_exposure(names: Sequence[str]) -> list[int]:
-    return [index for index, name in enumerate(names) if index < 2 or name == _CURVED]
+    return [index for index, name in enumerate(names) if index < 2 or name == _CURVATURE]
 
 
 def _share_of_exposure(names: Sequence[str], result: RegressionFit) -> tuple[float, float | None]:

@@ -1,4 +1,4 @@
-"""How well measured distances agree with reference poses, and how often the target is found."""
+"""Comparison of measured distances with reference poses, and of detections with visibility."""
 
 from __future__ import annotations
 
@@ -20,80 +20,81 @@ from kgcp.georef.target_positions import NoPosition, TargetPosition, TargetPosit
 from kgcp.settings import Method
 from kgcp.targets.plain import AnyTarget
 
-_VAGUE_TIMES, _VAGUE_M = 10.0, 0.1
-"""A reference is vague beyond so many medians of the standard deviations, and so many metres."""
+# The reference of a frame is vague if its standard deviation exceeds both: this factor times the
+# median, and this length.
+_VAGUE_FACTOR, _VAGUE_M = 10.0, 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _CameraPlace:
-    """Where the reference puts a camera when the target is exposed, in the ENU frame."""
+    """Pose of a camera by the reference when the target's row is exposed, in the ENU frame."""
 
     centre_m: FloatArray  # (3,): projection centre [m]
     enu_from_camera: FloatArray  # (3, 3): camera axes, as columns
-    # (3, 3): covariance of the centre [m²]; None: the poses have no deviations
+    # (3, 3): covariance of the centre [m²]; None: the poses have no standard deviations
     cov_m2: FloatArray | None
 
 
 @dataclass(frozen=True, slots=True)
 class ReferenceSds:
-    """Standard deviations of a reference distance, by where they come from."""
+    """Standard deviations of a reference distance, by origin."""
 
-    # of what is independent from frame to frame: the camera's reference position, its way until a
-    # rolling shutter has read the target, and the target's way between the trajectory's epochs [m]
+    # of errors that are independent from frame to frame [m]: the camera's reference position, its
+    # motion until a rolling shutter reads the target, and the trajectory's interpolation
     independent_m: float
-    place_m: float  # of the trajectory, attitude included: an error that lasts for a while [m]
+    # of the trajectory, attitude included [m]: errors that are correlated over some time
+    trajectory_m: float
     # of lever arm and synchronisation, or of a static target's position [m]: the same in all frames
     common_m: float
 
     @property
     def total_m(self) -> float:
-        """All three together [m]."""
-        return math.hypot(self.independent_m, self.place_m, self.common_m)
+        """Standard deviation by all three [m]."""
+        return math.hypot(self.independent_m, self.trajectory_m, self.common_m)
 
     @classmethod
     def along(
         cls, direction: FloatArray, position: TargetPosition, camera: _CameraPlace
     ) -> Self | None:
-        """Return those along a line of sight: a unit vector (3,) in the ENU frame.
+        """Return them along a line of sight, a unit vector (3,) in the ENU frame.
 
-        None where trajectory, static target or poses have no standard deviations.
+        None if trajectory, static target or poses have no standard deviations.
         """
         if position.cov_m2 is None or camera.cov_m2 is None:
             return None
         independent = float(direction @ camera.cov_m2 @ direction)
-        whole = float(direction @ position.cov_m2 @ direction)
-        between = 0.0
+        total = float(direction @ position.cov_m2 @ direction)
+        interpolation = 0.0
         if position.interpolation_m2 is not None:
-            between = min(whole, float(direction @ position.interpolation_m2 @ direction))
-        common = whole  # of a static target
+            interpolation = min(total, float(direction @ position.interpolation_m2 @ direction))
+        common = total  # of a static target
         if position.common_m is not None:
-            common = min(whole - between, float(np.sum((direction @ position.common_m) ** 2)))
-        place = max(0.0, whole - between - common)
-        return cls(math.sqrt(independent + between), math.sqrt(place), math.sqrt(common))
+            common = min(total - interpolation, float(np.sum((direction @ position.common_m) ** 2)))
+        trajectory = max(0.0, total - interpolation - common)
+        return cls(math.sqrt(independent + interpolation), math.sqrt(trajectory), math.sqrt(common))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """One attempt against the reference."""
+    """Comparison of one attempt with the reference."""
 
     attempt: Attempt
-    # (3,): reference projection centre, and the target's place at that time, in the ENU frame [m]
-    camera_m: FloatArray
-    place_m: FloatArray
-    # of the distance between the two; None where trajectory or poses have none
+    camera_m: FloatArray  # (3,): reference projection centre in the ENU frame [m]
+    target_m: FloatArray  # (3,): the target's position at that time in the ENU frame [m]
+    # of the distance between the two; None: trajectory or poses have no standard deviations
     sds: ReferenceSds | None
-    # (2,): where the reference pose puts the centre in the raw image [px]; NaN behind the camera
+    # (2,): centre in the raw image by the reference pose [px]; NaN behind the camera
     expected_px: FloatArray
-    expected_radius_px: float  # outer radius that the main ring has there [px]
+    expected_radius_px: float  # outer radius of the main ring by the reference pose [px]
 
     @property
     def reference_distance_m(self) -> float:
         """Between reference projection centre and target [m]."""
-        return math.dist(self.camera_m, self.place_m)
+        return math.dist(self.camera_m, self.target_m)
 
     @property
     def residual_m(self) -> float | None:
-        """Measured minus reference distance [m]; None where nothing was measured."""
+        """Measured minus reference distance [m]; None if nothing was measured."""
         sighting = self.attempt.sighting
         return None if sighting is None else sighting.distance_m - self.reference_distance_m
 
@@ -105,17 +106,14 @@ class Comparison:
 
     @property
     def is_misplaced(self) -> bool:
-        """Whether something was measured that is not where the target must be.
-
-        The limit is one radius of the ring.
-        """
+        """Whether the measured centre is more than one ring radius from the expected one."""
         sighting = self.attempt.sighting
         if sighting is None:
             return False
         return not math.dist(sighting.centre_px, self.expected_px) <= self.expected_radius_px
 
     def is_whole_in(self, camera: Camera) -> bool:
-        """Whether the reference puts the whole ring into the frame."""
+        """Whether the whole ring is in the frame by the reference pose."""
         margin = self.expected_radius_px
         limit = np.array([camera.width, camera.height]) - 1.0 - margin
         return bool(np.all((self.expected_px >= margin) & (self.expected_px <= limit)))
@@ -123,29 +121,29 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class BiasStudy:
-    """All that could be compared."""
+    """All comparisons of a flight, and the frames that could not be compared."""
 
     method: Method
-    measured: tuple[Comparison, ...]  # with a residual, in the frames' order
-    # frames in which the target must be wholly visible, measured or not
+    measured: tuple[Comparison, ...]  # those with a residual, in the order of the frames
+    # those in which the whole target should be visible, measured or not
     expected_visible: tuple[Comparison, ...]
-    # whether most measured centres lie where the reference attitudes put them. If not, nothing is
-    # called misplaced, and every frame with a pose counts as one that shows it.
+    # whether most measured centres are where the reference attitudes put them. If not, no centre
+    # counts as misplaced, and the target is expected in every frame with a pose.
     attitudes_agree: bool
-    frames_without_pose: tuple[str, ...]  # frames that the reference does not name
-    # frames with a reference distance far less certain than most, as while GNSS is out
+    frames_without_pose: tuple[str, ...]  # frames without a reference pose
+    # frames with a reference distance far less certain than in most, for example without GNSS
     frames_with_vague_reference: tuple[str, ...]
-    absences: tuple[NoPosition, ...]  # of the frames in which the position of the target is unknown
+    absences: tuple[NoPosition, ...]  # why the target's position is unknown in some frames
 
     def trusts(self, pair: Comparison) -> bool:
-        """Whether a comparison holds a measurement, and one of this target."""
+        """Whether a comparison has a measurement that is not misplaced."""
         return pair.attempt.sighting is not None and not (
             self.attitudes_agree and pair.is_misplaced
         )
 
     @property
     def trusted(self) -> tuple[Comparison, ...]:
-        """Measurements that statistics are made of."""
+        """Measurements that the statistics use."""
         return tuple(pair for pair in self.measured if self.trusts(pair))
 
 
@@ -163,21 +161,23 @@ def study_bias(
     Parameters
     ----------
     attempts : sequence of Attempt
-        One per frame and target; targets never measured are left out.
+        One per frame and target. Targets that were never measured are left out.
     motions : CameraMotions, optional
-        How the camera moves while a rolling shutter reads the frames, in the order of the poses:
-        these are those of the middle row. None: it does not move, or all rows are exposed at once.
+        Motion of the camera while a rolling shutter reads the frames, in the order of the poses.
+        The poses are those of the middle row. None: the camera does not move, or all rows are
+        exposed at once.
 
     Raises
     ------
     KgcpError
-        If nothing was measured, no measured frame has a pose, or as `TargetPositions.positions`.
+        If nothing was measured, if no measured frame has a pose, or as
+        `TargetPositions.positions`.
     """
-    ours = _with_measured_target(attempts)
+    considered = _with_measured_target(attempts)
     has_pose = set(poses.frames)
-    posed = [attempt for attempt in ours if attempt.frame in has_pose]
+    posed = [attempt for attempt in considered if attempt.frame in has_pose]
     if not any(attempt.sighting for attempt in posed):
-        raise KgcpError(_no_pose(ours, poses))
+        raise KgcpError(_no_pose(considered, poses))
     times = [
         attempt.sighting.row_time_s(camera) if attempt.sighting else attempt.time_s
         for attempt in posed
@@ -200,7 +200,7 @@ def study_bias(
         measured=measured,
         expected_visible=tuple(pair for pair in compared if not agree or pair.is_whole_in(camera)),
         attitudes_agree=agree,
-        frames_without_pose=tuple(sorted({each.frame for each in ours} - has_pose)),
+        frames_without_pose=tuple(sorted({each.frame for each in considered} - has_pose)),
         frames_with_vague_reference=vague,
         absences=tuple(position for position in positions if isinstance(position, NoPosition)),
     )
@@ -213,7 +213,7 @@ def _camera_places(
     motions: CameraMotions | None,
     camera: Camera,
 ) -> list[_CameraPlace]:
-    """Return the camera's place when the target of each attempt was exposed."""
+    """Return the camera's pose when the target's row of each attempt was exposed."""
     row_of = {frame: row for row, frame in enumerate(poses.frames)}
     places = []
     for attempt in attempts:
@@ -235,7 +235,7 @@ def _compare_all(
     camera: Camera,
     targets: Sequence[AnyTarget],
 ) -> list[Comparison]:
-    """Compare attempts with the camera's places in their frames."""
+    """Compare attempts with the camera's poses in their frames."""
     diameters = {target.name: target.outer_diameter_m for target in targets}
     in_camera = [
         (position.position_m - place.centre_m) @ place.enu_from_camera
@@ -255,15 +255,16 @@ def _compare_all(
 
 
 def _without_vague(pairs: Sequence[Comparison]) -> tuple[list[Comparison], tuple[str, ...]]:
-    """Return the comparisons without those that say nothing beside the others, and their frames.
+    """Return the comparisons without those of a vague reference, and the frames of the latter.
 
-    One error of metres, however honestly stated, would be most of an RMS over centimetres.
+    A single error of metres, even if its standard deviation is stated correctly, would dominate an
+    RMS of centimetres.
     """
     sds_m = [pair.sds.total_m for pair in pairs if pair.sds and pair.attempt.sighting]
-    most_m = max(_VAGUE_TIMES * float(np.median(sds_m)), _VAGUE_M) if sds_m else math.inf
+    max_sd_m = max(_VAGUE_FACTOR * float(np.median(sds_m)), _VAGUE_M) if sds_m else math.inf
     kept, vague = [], set()
     for pair in pairs:
-        if pair.sds is not None and pair.sds.total_m > most_m:
+        if pair.sds is not None and pair.sds.total_m > max_sd_m:
             vague.add(pair.attempt.frame)
         else:
             kept.append(pair)
@@ -274,8 +275,8 @@ def _with_measured_target(attempts: Sequence[Attempt]) -> list[Attempt]:
     measured = {attempt.target for attempt in attempts if attempt.sighting is not None}
     if not measured:
         raise KgcpError(
-            f"no target was measured in any of {len(attempts)} attempts; there is nothing to"
-            " compare, see the reasons that 'kgcp detect' gives"
+            f"no target was measured in {len(attempts)} attempts, so that there is nothing to"
+            " compare; see the reasons that 'kgcp detect' prints"
         )
     return [
         attempt
@@ -286,11 +287,12 @@ def _with_measured_target(attempts: Sequence[Attempt]) -> list[Attempt]:
 
 
 def _no_pose(attempts: Sequence[Attempt], poses: ReferencePoses) -> str:
-    ours = next(attempt.frame for attempt in attempts if attempt.sighting is not None)
-    theirs = f"'{poses.frames[0]}'" if poses.frames else "no frame at all"
+    measured = next(attempt.frame for attempt in attempts if attempt.sighting is not None)
+    posed = f"'{poses.frames[0]}'" if poses.frames else "no frame at all"
     return (
-        f"no measured frame has a reference pose: measured is for example '{ours}', the file of"
-        f" [reference] poses names {theirs}; its names must be relative to the frames folder"
+        f"no measured frame has a reference pose: the target was measured in '{measured}', for"
+        f" example, but the file of [reference] poses names {posed}; its names must be relative to"
+        " the frames folder"
     )
 
 
@@ -301,13 +303,13 @@ def _compare(
     expected_px: FloatArray,
     radius_px_m: float,
 ) -> Comparison:
-    """Compare one attempt with the place of the camera."""
+    """Compare one attempt with the pose of the camera."""
     sight = position.position_m - camera.centre_m
     distance = float(np.linalg.norm(sight))
     return Comparison(
         attempt=attempt,
         camera_m=camera.centre_m,
-        place_m=position.position_m,
+        target_m=position.position_m,
         sds=ReferenceSds.along(sight / distance, position, camera),
         expected_px=expected_px,
         expected_radius_px=radius_px_m / distance,
@@ -318,22 +320,22 @@ def _compare(
 class EdgeDistances:
     """Distances of one target by its edges, which exposure displaces."""
 
-    by_outer_edge_m: float  # with its displacement [m]
-    by_both_edges_m: float  # whose common displacement cancels out [m]
+    by_outer_edge_m: float  # affected by the displacement of that edge [m]
+    by_both_edges_m: float  # free of it, because the common displacement cancels out [m]
     outer_radius_px: float  # of the displaced outer edge [px]
 
 
 def edge_distances(pair: Comparison, method: Method) -> EdgeDistances | None:
-    """Return both distances of a comparison; None where it has no measurement, or no δ.
+    """Return both distances of a comparison; None if it has no measurement, or no edge shift δ.
 
-    Exposure displaces the outer edge by δ towards the dark ring, from the radius R to R − δ, and
-    a distance is inversely proportional to the radius. The paper's chain takes the pose from the
-    outer edge; the image model has displaced edges among its unknowns.
+    Exposure displaces the outer edge by δ towards the dark ring, from the radius R to R − δ.
+    Distances are inversely proportional to the radius. The paper's chain takes the pose from the
+    outer edge, and is affected; the image model estimates the displacement of edges, and is not.
     """
     sighting, exposure = pair.attempt.sighting, pair.attempt.exposure
     if sighting is None or exposure.edge_shift_px is None or exposure.radius_px is None:
         return None
-    if method is Method.PAPER:  # there the radius is that of the displaced edge
+    if method is Method.PAPER:  # its radius is that of the displaced edge
         share = exposure.edge_shift_px / exposure.radius_px
         return EdgeDistances(
             sighting.distance_m, sighting.distance_m / (1.0 + share), exposure.radius_px

@@ -19,23 +19,23 @@ from kgcp.quality.disc_light import DiscLight
 from kgcp.quality.eccentricity import parameters_if_neglected
 from kgcp.quality.frame_rays import ray_deviations_px
 
-_CELLS = (8, 6)  # of the frame, that discs cover or do not
-_LEAST_PLACES = 4
+_CELLS = (8, 6)  # columns and rows of the grid on which the coverage of the frame is counted
+_MIN_PLACES = 4
 _ADVISED_PLACES = 12
-_LEAST_DISCS = 6  # per photograph
-_MOST_REJECTED = 0.1
-_FOCAL_SHARE = 0.01
-_OPERATOR_RATIO = 3.0
-_FIELD_RATIO = 2.0
-_BAR_SDS = 3.0  # of a bar, by which the field may miss it
-_COVERAGE = 0.7
-_NORMALS_DEG = 15.0
-_RADIUS_SHARE = 0.03
-# Of the radii, from those of most photographs. Discs of R 4 px, sharpened and in motion, are off by
-# up to 5.5 % (ros10).
+_MIN_DISCS = 6  # per photograph
+_MAX_REJECTED_SHARE = 0.1
+_MAX_FOCAL_SD = 0.01  # relative
+_MAX_OPERATOR_RATIO = 3.0  # of an RMS to the standard deviation with which discs are measured
+_MAX_FIELD_RATIO = 2.0  # of the discs' deviations from the field to what it states
+_MAX_BAR_SDS = 3.0  # of a bar's residual
+_MIN_COVERAGE = 0.7
+_MIN_NORMALS_DEG = 15.0  # largest angle between two normals of the field
+_MAX_RADIUS_ERROR = 0.03  # relative, of the stated diameters
+# Relative difference of the discs' size in one photograph from that in most, above which it shows
+# another field. Sharpened discs in motion, of 4 px radius, differ by up to 5.5 % (data set ros10).
 _OTHER_FIELD_SHARE = 0.1
-_NAMED = 3  # photographs or discs; of more, the number is said
-_WIDE_DEG = 100.0  # of the field of view, beyond which lenses are fisheyes
+_MAX_NAMED = 3  # photographs or discs in a message; the others are counted
+_FISHEYE_DEG = 100.0  # field of view beyond which lenses are mostly fisheyes
 
 
 class CalibrationGrade(StrEnum):
@@ -48,62 +48,63 @@ class CalibrationGrade(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class FieldDeviation:
-    """How far discs are from where they are meant to be, shift, turn and scale taken out."""
+    """Deviations of discs from their stated places, without shift, rotation and scale."""
 
     in_plane_m: float  # RMS along the field's axes x and y
     height_m: float  # RMS along z
-    in_plane_ratio: float  # RMS over what is stated to be possible
+    # RMS of the deviations over their stated standard deviations
+    in_plane_ratio: float
     height_ratio: float
 
     @property
     def doubt(self) -> str:
-        """What the field is not; empty: it is as stated."""
-        found = [
+        """In what the field is not as stated; empty: it is."""
+        parts = [
             f"{1000.0 * off_m:.2f} mm {where}, {ratio:.1f} times as much as stated"
             for off_m, ratio, where in (
                 (self.in_plane_m, self.in_plane_ratio, "in its plane"),
                 (self.height_m, self.height_ratio, "in height"),
             )
-            if ratio > _FIELD_RATIO
+            if ratio > _MAX_FIELD_RATIO
         ]
-        return f"discs are off by {' and by '.join(found)}" if found else ""
+        return f"discs are off by {' and by '.join(parts)}" if parts else ""
 
 
 @dataclass(frozen=True, slots=True)
 class FieldBending:
-    """How much a field bends from photograph to photograph, in the mean of all."""
+    """Bending of a field from photograph to photograph."""
 
-    height_m: float  # RMS of the discs
-    image_px: float  # RMS of what it displaces their images
+    height_m: float  # RMS displacement of the discs
+    image_px: float  # RMS displacement of their images
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationNumbers:
-    """What the verdict depends on."""
+    """Numbers on which the verdict depends."""
 
-    views: int
-    places: int  # that they were taken from
+    views: int  # photographs
+    places: int  # from which they were taken
     discs: int
     discs_used: int
-    rms_fixed_px: float
+    rms_fixed_px: float  # with the field as stated
     rms_px: float
-    operator_sd_px: float
+    operator_sd_px: float  # with which discs are measured
     sd: FloatArray  # (12,): of `CALIBRATION_PARAMETERS`
     coverage: float  # share of the frame's cells that have a disc
     tilts_deg: FloatArray  # (v,): of the field against the optical axis
     normals_deg: float  # largest angle between two normals
     turns_deg: FloatArray  # (v,): of the field about the optical axis
     field_of_view_deg: float  # across the diagonal
-    # (h, w): standard deviation of a pixel's ray, with turns of the camera taken out [px]
+    # (h, w): standard deviation of a pixel's ray, apart from a rotation of the camera [px]
     ray_sd_px: FloatArray
-    flatness_m: float | None  # RMS of the field's heights; None: it was taken as flat
-    field: FieldDeviation | None  # None: it was taken as stated
-    bending: FieldBending | None  # None: it is the same in all photographs, as far as they tell
+    flatness_m: float | None  # RMS of the field's heights; None: taken as stated
+    field: FieldDeviation | None  # None: taken as stated
+    bending: FieldBending | None  # None: no bending was estimated
     light: DiscLight | None  # None: levels are not known
 
     @property
     def photographs(self) -> str:
-        """How many photographs there are, and from how many places if these are fewer."""
+        """The number of photographs, and that of places if there are fewer, in words."""
         if self.places == self.views:
             return f"{self.views} photographs"
         places = "1 place" if self.places == 1 else f"{self.places} places"
@@ -128,12 +129,12 @@ class CalibrationVerdict:
 def calibration_numbers(
     calibration: CameraCalibration, light: DiscLight | None = None
 ) -> CalibrationNumbers:
-    """Return what the verdict and the report need.
+    """Return the numbers for the verdict and the report.
 
     Parameters
     ----------
     light : DiscLight, optional
-        By `light_on_discs`, of the photographs that were used.
+        From `light_on_discs`, for the photographs that were used.
     """
     camera, estimate = calibration.camera, calibration.solution.estimate
     places = np.concatenate([view.vectors[:, :2] for view in calibration.views])
@@ -183,18 +184,18 @@ def _field_bending(calibration: CameraCalibration) -> FieldBending | None:
 
 
 def _field_deviation(calibration: CameraCalibration) -> FieldDeviation | None:
-    """Return how far the discs that were seen are from where they are meant to be."""
+    """Return how far the imaged discs are from their stated places."""
     if calibration.points_used is PointModel.FIXED:
         return None
     field = calibration.field
-    seen = np.unique(np.concatenate([view.point for view in calibration.views]))
-    meant, found = field.points_m()[seen], calibration.solution.estimate.points[seen]
-    found = (found - found.mean(axis=0)) @ rotation_onto(found, meant).T
-    meant = meant - meant.mean(axis=0)
-    # without a measured distance, photographs do not tell how large the field is
-    scale = 1.0 if field.bars else float(np.sum(meant * found) / np.sum(found**2))
-    off = scale * found - meant
-    ratio = off / field.point_sds_m()[seen]
+    imaged = np.unique(np.concatenate([view.point for view in calibration.views]))
+    stated, estimated = field.points_m()[imaged], calibration.solution.estimate.points[imaged]
+    estimated = (estimated - estimated.mean(axis=0)) @ rotation_onto(estimated, stated).T
+    stated = stated - stated.mean(axis=0)
+    # without a measured distance, photographs do not determine the scale of the field
+    scale = 1.0 if field.bars else float(np.sum(stated * estimated) / np.sum(estimated**2))
+    off = scale * estimated - stated
+    ratio = off / field.point_sds_m()[imaged]
     return FieldDeviation(_rms(off[:, :2]), _rms(off[:, 2]), _rms(ratio[:, :2]), _rms(ratio[:, 2]))
 
 
@@ -203,9 +204,9 @@ def _rms(values: FloatArray) -> float:
 
 
 def change_if_neglected(calibration: CameraCalibration) -> dict[str, float]:
-    """Return by how much each camera parameter is wrong if eccentricities are neglected.
+    """Return the error of each camera parameter if eccentricities are neglected.
 
-    One linear step of the adjustment of cameras and poses, the field as it is.
+    It is computed by one linear step of the adjustment of camera and poses, with a fixed field.
     """
     network, solution = calibration.network, calibration.solution
     fixed = replace(network, points=PointPrior(solution.estimate.points, None), bends=None)
@@ -240,23 +241,23 @@ def judge(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Calibr
 
 
 def _unusable(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iterator[str]:
-    if numbers.views < _LEAST_PLACES:
-        yield f"{numbers.views} photographs are fewer than {_LEAST_PLACES}"
-    elif numbers.places < _LEAST_PLACES:
-        yield f"{numbers.photographs} only, fewer than {_LEAST_PLACES}"
-    if numbers.discs_used < _LEAST_DISCS * numbers.views:
-        yield f"there are fewer than {_LEAST_DISCS} discs per photograph"
+    if numbers.views < _MIN_PLACES:
+        yield f"{numbers.views} photographs are fewer than {_MIN_PLACES}"
+    elif numbers.places < _MIN_PLACES:
+        yield f"{numbers.photographs} only, fewer than {_MIN_PLACES}"
+    if numbers.discs_used < _MIN_DISCS * numbers.views:
+        yield f"there are fewer than {_MIN_DISCS} discs per photograph"
     rejected = 1.0 - numbers.discs_used / numbers.discs
-    if rejected > _MOST_REJECTED:
+    if rejected > _MAX_REJECTED_SHARE:
         yield f"{100.0 * rejected:.0f} % of the discs do not fit"
-    share = numbers.sd[0] / calibration.camera.fx
-    if share > _FOCAL_SHARE:
-        yield f"the focal length is known to {100.0 * share:.1f} % only"
+    focal_sd = numbers.sd[0] / calibration.camera.fx
+    if focal_sd > _MAX_FOCAL_SD:
+        yield f"the focal length is known to {100.0 * focal_sd:.1f} % only"
     if {"cx", "cy"} & set(calibration.undetermined):
         yield "the principal point is not determined"
-    far_off_px = 10.0 * _OPERATOR_RATIO * numbers.operator_sd_px
-    if numbers.field_of_view_deg > _WIDE_DEG and numbers.rms_px > far_off_px:
-        yield "the lens looks like a fisheye, which kgcp's camera is not"
+    far_off_px = 10.0 * _MAX_OPERATOR_RATIO * numbers.operator_sd_px
+    if numbers.field_of_view_deg > _FISHEYE_DEG and numbers.rms_px > far_off_px:
+        yield "the lens looks like a fisheye, which kgcp's camera model does not describe"
 
 
 def _more_photographs(numbers: CalibrationNumbers) -> str:
@@ -279,17 +280,17 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
     if never := discs_that_never_fit(calibration):
         discs = "disc {} does" if len(never) == 1 else "discs {} do"
         yield f"{discs.format(_listed(never))} not fit in any photograph"
-    if numbers.coverage < _COVERAGE:
-        yield f"discs cover {100.0 * numbers.coverage:.0f} % of the frame"
-    if numbers.normals_deg < _NORMALS_DEG:
-        yield f"all photographs look from within {numbers.normals_deg:.0f}°"
+    if numbers.coverage < _MIN_COVERAGE:
+        yield f"discs cover only {100.0 * numbers.coverage:.0f} % of the frame"
+    if numbers.normals_deg < _MIN_NORMALS_DEG:
+        yield f"viewing directions differ by only {numbers.normals_deg:.0f}°"
     off = calibration.radius_scale - 1.0
     if _has_other_discs(calibration):
         other = "larger" if off > 0.0 else "smaller"
         yield f"discs are {100.0 * abs(off):.0f} % {other} than stated"
-    if others := _of_other_discs(calibration):
+    if others := _photos_of_another_field(calibration):
         yield (
-            f"by their distances, discs have another size in {_listed(others)} than in most"
+            f"relative to their spacing, discs in {_listed(others)} have another size than in most"
             " photographs: give photographs of one field only"
         )
     if calibration.is_turn_unclear:
@@ -310,8 +311,8 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
 def _field_doubts(numbers: CalibrationNumbers) -> Iterator[str]:
     if numbers.field is not None and numbers.field.doubt:
         yield (
-            f"the field is not what it is said to be: {numbers.field.doubt}"
-            f" ({numbers.rms_fixed_px:.2f} px as stated, {numbers.rms_px:.3f} px in its own shape)"
+            f"the field is not as stated: {numbers.field.doubt} (RMS {numbers.rms_fixed_px:.2f} px"
+            f" with the field as stated, {numbers.rms_px:.3f} px with its estimated shape)"
         )
     if numbers.bending is not None and _bends_much(numbers):
         bending = numbers.bending
@@ -322,17 +323,17 @@ def _field_doubts(numbers: CalibrationNumbers) -> Iterator[str]:
 
 
 def discs_that_never_fit(calibration: CameraCalibration) -> tuple[str, ...]:
-    """Return the discs that several photographs show, and that do not fit in any of them."""
+    """Return the discs that are in several photographs but fit in none of them."""
     point = calibration.network.observations.point
     names = calibration.field.names()
-    shown = np.bincount(point, minlength=len(names))
+    photographs = np.bincount(point, minlength=len(names))
     used = np.bincount(point[calibration.solution.is_used], minlength=len(names))
-    return tuple(names[k] for k in np.flatnonzero((shown > 1) & (used == 0)).tolist())
+    return tuple(names[k] for k in np.flatnonzero((photographs > 1) & (used == 0)).tolist())
 
 
 def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:_NAMED]) + (
-        f" and {len(names) - _NAMED} more" if names[_NAMED:] else ""
+    return ", ".join(names[:_MAX_NAMED]) + (
+        f" and {len(names) - _MAX_NAMED} more" if names[_MAX_NAMED:] else ""
     )
 
 
@@ -342,7 +343,7 @@ def _bar_doubts(calibration: CameraCalibration) -> Iterator[str]:
         yield "the field is taken as stated, so that its bars are not used"
         return
     for bar, residual_m in zip(bars, calibration.bar_residuals_m, strict=True):
-        if abs(residual_m) > _BAR_SDS * bar.sd_m:
+        if abs(residual_m) > _MAX_BAR_SDS * bar.sd_m:
             yield (
                 f"the bar from {bar.first} to {bar.second} is {1000.0 * abs(residual_m):.2g} mm"
                 f" {'longer' if residual_m > 0.0 else 'shorter'} than the photographs and the other"
@@ -351,59 +352,62 @@ def _bar_doubts(calibration: CameraCalibration) -> Iterator[str]:
 
 
 def _fits_badly(numbers: CalibrationNumbers) -> bool:
-    return numbers.rms_px > _OPERATOR_RATIO * numbers.operator_sd_px
+    return numbers.rms_px > _MAX_OPERATOR_RATIO * numbers.operator_sd_px
 
 
 def _bends_much(numbers: CalibrationNumbers) -> bool:
-    """Return whether bends of the field displace discs by more than errors of their operator."""
+    """Tell whether the field's bending displaces discs by more than measuring errors."""
     if numbers.bending is None:
         return False
-    return numbers.bending.image_px > _OPERATOR_RATIO * numbers.operator_sd_px
+    return numbers.bending.image_px > _MAX_OPERATOR_RATIO * numbers.operator_sd_px
 
 
 def _has_other_discs(calibration: CameraCalibration) -> bool:
-    """Return whether diameters are not those that the field states."""
+    """Tell whether diameters differ from those that the field states."""
     is_stated = calibration.field.is_diameter_stated
-    return is_stated and abs(calibration.radius_scale - 1.0) > _RADIUS_SHARE
+    return is_stated and abs(calibration.radius_scale - 1.0) > _MAX_RADIUS_ERROR
 
 
-def _of_other_discs(calibration: CameraCalibration) -> list[str]:
-    """Return the photographs whose discs are not as large as in most, by the field's pitch."""
+def _photos_of_another_field(calibration: CameraCalibration) -> list[str]:
+    """Return the photographs whose discs, relative to their pitch, have another size than most."""
     scales = calibration.radius_scales
     off = np.abs(scales / np.nanmedian(scales) - 1.0)
     return [calibration.views[k].photo for k in np.flatnonzero(off > _OTHER_FIELD_SHARE).tolist()]
 
 
 def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iterator[str]:
-    if numbers.normals_deg < 2.0 * _NORMALS_DEG or np.median(numbers.tilts_deg) < _NORMALS_DEG:
+    if (
+        numbers.normals_deg < 2.0 * _MIN_NORMALS_DEG
+        or np.median(numbers.tilts_deg) < _MIN_NORMALS_DEG
+    ):
         yield "Tilt the field by 25° to 40° about both axes, in all four directions."
     turns = np.radians(numbers.turns_deg)
-    # share of the directions along one axis: 1 if all photographs are held in the same way
-    alike = float(np.abs(np.mean(np.exp(2j * turns))))
-    if alike > 0.9:
+    # 1 if the camera is held the same way, or upside down, in all photographs
+    alignment = float(np.abs(np.mean(np.exp(2j * turns))))
+    if alignment > 0.9:
         yield "Turn the camera by 90° in at least two photographs."
-    if numbers.coverage < _COVERAGE:
+    if numbers.coverage < _MIN_COVERAGE:
         yield "Bring the field into the corners of the frame."
     if calibration.dropped or _fits_badly(numbers):
         if _is_aspect_untried(calibration):
             yield "Estimate two focal lengths: the pixels may not be square."
         yield (
-            "Keep zoom, focus and crop the same in all photographs, none turned afterwards, and the"
-            " field rigid. If those that do not fit are the only ones to reach the corners, it may"
-            " be a lens that no model here describes."
+            "Keep zoom, focus and crop the same in all photographs, rotate none of them afterwards,"
+            " and keep the field rigid. If only photographs that do not fit reach the corners, the"
+            " lens may be one that kgcp's models do not describe."
         )
     if numbers.places < _ADVISED_PLACES:
         yield _more_photographs(numbers)
     if calibration.undetermined:
         names = ", ".join(calibration.undetermined)
-        yield f"Not determined by these photographs: {names}; come nearer, and tilt more."
+        yield f"These photographs do not determine {names}: come closer, and tilt more."
     yield from _field_advice(calibration, numbers)
     if numbers.light is not None and numbers.light.doubt:
-        yield "Give photographs as the camera took them, no negatives, and white not burnt."
+        yield "Give photographs as the camera took them, not negatives, and without burnt white."
 
 
 def _is_aspect_untried(calibration: CameraCalibration) -> bool:
-    """Return whether the camera has one focal length because nobody tried two."""
+    """Tell whether the camera has one focal length because two were not tried."""
     settings = calibration.settings
     is_tried = settings.lens is LensModel.AUTO and settings.is_same_aspect is None
     return "fy" not in calibration.network.model.names and not is_tried
@@ -415,12 +419,12 @@ def _field_advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -
     if _has_other_discs(calibration):
         yield (
             "Measure the diameter and the pitch of the print; the camera does not depend on them."
-            " Burnt white also displaces edges."
+            " Burnt white may also be the cause, because it displaces edges."
         )
     if discs_that_never_fit(calibration):
         yield (
-            "Correct the places or codes of the discs that do not fit in any photograph, or take"
-            " them out of the field's description."
+            "Correct the places or codes of the discs that do not fit in any photograph, or remove"
+            " them from the field's description."
         )
     if calibration.is_turn_unclear:
         yield "Give the field a mark: one disc that is hollow, larger or missing."

@@ -1,4 +1,4 @@
-"""The target's places by its vehicle against those by the camera's reference poses."""
+"""Comparison of the target's positions by the vehicle with those by the camera's poses."""
 
 from __future__ import annotations
 
@@ -14,41 +14,42 @@ from kgcp.geometry.camera import Camera
 from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition, TargetPositions
-from kgcp.quality.consistency_equations import Meeting, System
+from kgcp.quality.consistency_equations import ComparedFrame, ConsistencyEquations
 from kgcp.quality.corrections import UNKNOWN_LIMITS, CorrectionEstimate, estimate_corrections
 from kgcp.quality.robust_gls import ErrorModel, find_outliers, whitened_products
 from kgcp.settings import VehicleSettings
 
-LEAST_MEETINGS = 10
-_CORRELATIONS_S = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
-_FLOOR_M2 = 1e-12  # keeps a covariance that is zero along an axis invertible
+MIN_FRAMES = 10
+_CORRELATION_TIMES_S = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
+_REGULARISATION_M2 = 1e-12  # keeps a covariance that is zero along an axis invertible
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Discrepancy:
-    """Between the two places of a target in one frame."""
+    """Difference between the two positions of a target in one frame."""
 
     # as in the sighting
     frame: str
     target: str
     time_s: float  # when the target's row was exposed, by the trajectory's clock, Unix UTC [s]
-    # (3,): by the vehicle minus by the camera: along the track, across it to the right, up [m]
+    # (3,): position by the vehicle minus position by the camera, along the track, across it to the
+    # right, and up [m]
     offset_m: FloatArray
-    # (3, 3): by all stated standard deviations but those that all frames share [m²]
+    # (3, 3): by all stated standard deviations except those of errors that all frames share [m²]
     cov_m2: FloatArray
-    residual_m: FloatArray  # (3,): what the corrections leave of the offset [m]
-    is_outlier: bool  # whether it fits no correction and was left out
+    residual_m: FloatArray  # (3,): offset after the corrections [m]
+    is_outlier: bool  # whether it was left out of the adjustment
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Consistency:
-    """How well vehicle and camera agree."""
+    """Agreement of vehicle and camera."""
 
     discrepancies: tuple[Discrepancy, ...]  # ascending in time
     estimate: CorrectionEstimate  # corrections that explain them
-    # over which the trajectory's errors seem to fade: the likeliest of a few times [s]
+    # correlation time of the trajectory's errors, the likeliest of `_CORRELATION_TIMES_S` [s]
     correlation_s: float
-    # how well flight.toml says that unknowns are known, by their names and in their units
+    # standard deviations by flight.toml, by the names of the unknowns and in their units
     stated_sd: Mapping[str, float]
 
 
@@ -58,48 +59,49 @@ def study_consistency(
     poses: ReferencePoses,
     camera: Camera,
 ) -> Consistency | None:
-    """Compare the places of the target on the vehicle with those that the camera gives it.
+    """Compare the target's positions by the vehicle with those by the camera.
 
-    By the vehicle: trajectory and lever arm. By the camera: reference pose and measured pose of
-    the target, P = C + R(ENU ← camera) t, where a rolling shutter's camera has moved on, too.
+    The first follow from trajectory and lever arm. The others follow from the reference pose of the
+    camera and the measured pose of the target, P = C + R(ENU ← camera) t. With a rolling shutter, C
+    includes the camera's motion until the target's row is exposed.
 
     Parameters
     ----------
     sightings : sequence of Sighting
-        Without a pose or a reference pose they are passed over, and so are static targets.
+        Those of static targets, and those without a pose or a reference pose, are not used.
 
     Returns
     -------
     Consistency or None
-        None with fewer than ten frames to compare, or that fit any correction.
+        None if fewer than ten frames can be compared, or if fewer than ten are no outliers.
 
     Raises
     ------
     KgcpError
         As `TargetPositions.positions`.
     """
-    meetings = _meet(sightings, target_positions, poses, camera)
-    if len(meetings) < LEAST_MEETINGS or target_positions.vehicle is None:
+    frames = _compared_frames(sightings, target_positions, poses, camera)
+    if len(frames) < MIN_FRAMES or target_positions.vehicle is None:
         return None
     orientations = ExteriorOrientations.of(poses, target_positions.local_frame)
-    equations = System.of(
-        meetings, orientations, poses, camera, target_positions.vehicle.settings.sd_time_s
+    equations = ConsistencyEquations.of(
+        frames, orientations, poses, camera, target_positions.vehicle.settings.sd_time_s
     )
     outlier = find_outliers(
         -equations.design,
         equations.offset,
-        equations.fading + equations.white,
+        equations.correlated + equations.independent,
         limits=UNKNOWN_LIMITS,
-        least_scale=1.0,
+        min_scale=1.0,
     )
-    if np.count_nonzero(~outlier) < LEAST_MEETINGS:
+    if np.count_nonzero(~outlier) < MIN_FRAMES:
         return None
     fitted, correlation_s = _adjust(
-        np.array([meeting.time_s for meeting in meetings]), equations, ~outlier
+        np.array([frame.time_s for frame in frames]), equations, ~outlier
     )
     settings = target_positions.vehicle.settings
     return Consistency(
-        _discrepancies(meetings, equations, outlier, fitted, settings.time_offset_s),
+        _discrepancies(frames, equations, outlier, fitted, settings.time_offset_s),
         fitted,
         correlation_s,
         _stated_sd(settings),
@@ -113,37 +115,37 @@ def _stated_sd(settings: VehicleSettings) -> Mapping[str, float]:
 
 
 def _adjust(
-    time_s: FloatArray, equations: System, kept: BoolArray
+    time_s: FloatArray, equations: ConsistencyEquations, kept: BoolArray
 ) -> tuple[CorrectionEstimate, float]:
-    """Return the corrections by the points that are kept, and the likeliest correlation time.
+    """Return the corrections from the frames that are kept, and the likeliest correlation time.
 
-    A time that is believed but wrong would weigh neighbouring frames against each other as if
-    their trajectory were far better, or worse, than it is.
+    The time is estimated, not assumed. A wrong one would weight neighbouring frames as if their
+    trajectory were far better, or far worse, than it is.
     """
     columns = np.concatenate(
         (equations.design, equations.offset[:, :, None], equations.common[:, :, None]), axis=2
     )[kept]
-    fading = equations.fading + _FLOOR_M2 * np.eye(3)
-    errors = ErrorModel(equations.white, fading, time_s).kept(kept)
+    correlated = equations.correlated + _REGULARISATION_M2 * np.eye(3)
+    errors = ErrorModel(equations.independent, correlated, time_s).kept(kept)
     trials = []
-    for correlation_s in _CORRELATIONS_S:
+    for correlation_s in _CORRELATION_TIMES_S:
         products, log_det = whitened_products(columns, errors, correlation_s)
         fitted = estimate_corrections(products, 3 * len(columns), has_sds=equations.has_sds)
         misfit = fitted.chi2_after
-        if not equations.has_sds:  # the likeliest scale is part of the likelihood
+        if not equations.has_sds:  # likelihood with the likeliest scale of all variances
             misfit = 3 * len(columns) * math.log(misfit)
         trials.append((misfit + log_det, correlation_s, fitted))
     _, correlation_s, fitted = min(trials, key=lambda trial: trial[0])
     return fitted, correlation_s
 
 
-def _meet(
+def _compared_frames(
     sightings: Sequence[Sighting],
     target_positions: TargetPositions,
     poses: ReferencePoses,
     camera: Camera,
-) -> list[Meeting]:
-    """Return where moving targets were measured in frames with reference poses, by time."""
+) -> list[ComparedFrame]:
+    """Return the frames with reference poses in which a moving target was measured, by time."""
     rows = {frame: row for row, frame in enumerate(poses.frames)}
     moving = [
         sighting
@@ -156,8 +158,8 @@ def _meet(
         return []
     times = [sighting.row_time_s(camera) for sighting in moving]
     positions = target_positions.positions([sighting.target for sighting in moving], times)
-    meetings = [
-        Meeting(
+    frames = [
+        ComparedFrame(
             sighting, sighting.pose, time_s, position, position.vehicle_state, rows[sighting.frame]
         )
         for sighting, time_s, position in zip(moving, times, positions, strict=True)
@@ -166,31 +168,31 @@ def _meet(
         and sighting.pose
         and time_s is not None
     ]
-    return sorted(meetings, key=lambda meeting: (meeting.time_s, meeting.sighting.frame))
+    return sorted(frames, key=lambda frame: (frame.time_s, frame.sighting.frame))
 
 
 def _discrepancies(
-    meetings: Sequence[Meeting],
-    equations: System,
+    frames: Sequence[ComparedFrame],
+    equations: ConsistencyEquations,
     outlier: BoolArray,
     fitted: CorrectionEstimate,
     time_offset_s: float,
 ) -> tuple[Discrepancy, ...]:
-    """Return what images and poses are apart by, before and after the corrections."""
+    """Return the discrepancies before and after the corrections."""
     residual = equations.offset + equations.design @ fitted.values
     track = equations.track
-    cov = track @ (equations.fading + equations.white) @ np.swapaxes(track, 1, 2)
+    cov = track @ (equations.correlated + equations.independent) @ np.swapaxes(track, 1, 2)
     offset_m = np.einsum("nij,nj->ni", track, equations.offset)
     residual_m = np.einsum("nij,nj->ni", track, residual)
     return tuple(
         Discrepancy(
-            meeting.sighting.frame,
-            meeting.sighting.target,
-            meeting.time_s + time_offset_s,
+            frame.sighting.frame,
+            frame.sighting.target,
+            frame.time_s + time_offset_s,
             offset_m[index],
             cov[index],
             residual_m[index],
             bool(outlier[index]),
         )
-        for index, meeting in enumerate(meetings)
+        for index, frame in enumerate(frames)
     )

@@ -1,4 +1,4 @@
-"""The equations of the comparison: discrepancies, what moves them, and how well they are known."""
+"""The equations of the comparison: discrepancies, their derivatives and their covariances."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition, VehicleState
 
-_MODEL_SD_M = 0.001  # interpolation and rounding; keeps covariances regular
-_UNSTATED_SD_M = 0.01  # of what states none; the residuals set the scale then
-_STANDING_M_S = 0.2  # below, the track is where the vehicle points
-_NEIGHBOUR_S = 5.0  # over which a camera's velocity shows in its positions
+_MODEL_SD_M = 0.001  # of interpolation and rounding; keeps covariances regular
+_UNSTATED_SD_M = 0.01  # of data without standard deviations; the residuals then set the scale
+_STANDING_M_S = 0.2  # below this speed, the direction of the track is the vehicle's heading
+_MAX_INTERVAL_S = 5.0  # between camera positions through which its velocity is interpolated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Meeting:
-    """One frame in which the target's place is known twice."""
+class ComparedFrame:
+    """One frame in which the target's position is known both by the vehicle and by the camera."""
 
     sighting: Sighting
     pose: Pose  # of the sighting, target → camera
@@ -36,18 +36,17 @@ class Meeting:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class System:
-    """Discrepancies of n meetings in ENU axes, and everything that they are made of."""
+class ConsistencyEquations:
+    """Discrepancies of n frames in ENU axes, with derivatives and covariances."""
 
-    offset: FloatArray  # (n, 3): place by the vehicle minus place by the camera [m]
-    # (n, 3, 8): what one unit of each of the `UNKNOWNS`, as a correction, adds to it
+    offset: FloatArray  # (n, 3): position by the vehicle minus position by the camera [m]
+    # (n, 3, 8): change of the offset by a correction of one unit of each of the `UNKNOWNS`
     design: FloatArray
-    # (n, 3, 3): covariance by the trajectory, and by all that is independent from frame to frame
-    # [m²]
-    fading: FloatArray
-    white: FloatArray
-    # (n, 3): what one standard deviation of calibration and diameter, by way of the distance, adds
-    # to it [m]
+    correlated: FloatArray  # (n, 3, 3): covariance by the trajectory, correlated over time [m²]
+    # (n, 3, 3): covariance by all errors that are independent from frame to frame [m²]
+    independent: FloatArray
+    # (n, 3): change of the offset by one standard deviation of calibration and diameter, which
+    # change the distance [m]
     common: FloatArray
     has_sds: bool  # whether trajectory and reference poses have standard deviations
     track: FloatArray  # (n, 3, 3): along the track, across it to the right and up, as rows
@@ -55,66 +54,78 @@ class System:
     @classmethod
     def of(
         cls,
-        meetings: Sequence[Meeting],
+        frames: Sequence[ComparedFrame],
         orientations: ExteriorOrientations,
         poses: ReferencePoses,
         camera: Camera,
         sd_time_s: float,
     ) -> Self:
-        """Set up the system of meetings, in their order in time."""
-        rows = [meeting.row for meeting in meetings]
+        """Set up the equations of frames in the order of time."""
+        rows = [frame.row for frame in frames]
         attitude = orientations.enu_from_camera[rows]
-        in_camera = np.array([meeting.pose.translation_m for meeting in meetings])
+        in_camera = np.array([frame.pose.translation_m for frame in frames])
         sight = np.einsum("nij,nj->ni", attitude, in_camera)
-        velocity = np.array([meeting.vehicle_state.velocity_m_s for meeting in meetings])
-        body = np.array([meeting.vehicle_state.frame_from_body for meeting in meetings])
-        since_middle = np.array(
-            [meeting.sighting.rows_since_middle(camera) for meeting in meetings]
-        )[:, None]
-        moved = _camera_velocity(meetings, orientations.centre_m[rows], velocity)
-        centre = orientations.centre_m[rows] + moved * since_middle * camera.readout_s
-        offset = np.array([meeting.position.position_m for meeting in meetings]) - centre - sight
-        columns = (velocity[:, :, None], body, (since_middle * (velocity - moved))[:, :, None])
+        velocity = np.array([frame.vehicle_state.velocity_m_s for frame in frames])
+        body = np.array([frame.vehicle_state.frame_from_body for frame in frames])
+        since_middle = np.array([frame.sighting.rows_since_middle(camera) for frame in frames])[
+            :, None
+        ]
+        camera_velocity = _camera_velocity(frames, orientations.centre_m[rows], velocity)
+        centre = orientations.centre_m[rows] + camera_velocity * since_middle * camera.readout_s
+        offset = np.array([frame.position.position_m for frame in frames]) - centre - sight
+        columns = (
+            velocity[:, :, None],
+            body,
+            (since_middle * (velocity - camera_velocity))[:, :, None],
+        )
         design = np.concatenate((*columns, attitude @ cross_matrix(in_camera)), axis=2)
-        fading = np.array([_fading_m2(meeting.position) for meeting in meetings])
-        white = _white_m2(meetings, orientations, poses, sight)
+        correlated = np.array([_correlated_m2(frame.position) for frame in frames])
+        independent = _independent_m2(frames, orientations, poses, sight)
         shift = sd_time_s * velocity
-        white = white + shift[:, :, None] * shift[:, None, :]
-        white = white + np.array([_interpolation_m2(meeting.position) for meeting in meetings])
-        common_m = np.array([meeting.sighting.sd_common_distance_m or 0.0 for meeting in meetings])
+        independent = independent + shift[:, :, None] * shift[:, None, :]
+        independent = independent + np.array(
+            [_interpolation_m2(frame.position) for frame in frames]
+        )
+        common_m = np.array([frame.sighting.sd_common_distance_m or 0.0 for frame in frames])
         unit = sight / np.linalg.norm(sight, axis=1, keepdims=True)
         stated = (
-            all(meeting.position.cov_m2 is not None for meeting in meetings)
+            all(frame.position.cov_m2 is not None for frame in frames)
             and orientations.cov_m2 is not None
         )
         return cls(
-            offset, design, fading, white, unit * common_m[:, None], stated, _track(velocity, body)
+            offset,
+            design,
+            correlated,
+            independent,
+            unit * common_m[:, None],
+            stated,
+            _track(velocity, body),
         )
 
 
-def _fading_m2(position: TargetPosition) -> FloatArray:
+def _correlated_m2(position: TargetPosition) -> FloatArray:
     if position.cov_m2 is None or position.common_m is None:
         return _UNSTATED_SD_M**2 * np.eye(3)
-    lasting = position.cov_m2 - position.common_m @ position.common_m.T
-    return np.asarray(lasting - _interpolation_m2(position))
+    not_common = position.cov_m2 - position.common_m @ position.common_m.T
+    return np.asarray(not_common - _interpolation_m2(position))
 
 
 def _interpolation_m2(position: TargetPosition) -> FloatArray:
-    between = position.interpolation_m2
-    return np.zeros((3, 3)) if between is None else between
+    interpolation = position.interpolation_m2
+    return np.zeros((3, 3)) if interpolation is None else interpolation
 
 
-def _white_m2(
-    meetings: Sequence[Meeting],
+def _independent_m2(
+    frames: Sequence[ComparedFrame],
     orientations: ExteriorOrientations,
     poses: ReferencePoses,
     sight: FloatArray,
 ) -> FloatArray:
     """Return the covariance (n, 3, 3) of reference poses and measured poses, in ENU axes."""
-    rows = [meeting.row for meeting in meetings]
+    rows = [frame.row for frame in frames]
     attitude = orientations.enu_from_camera[rows]
     total = np.broadcast_to(_MODEL_SD_M**2 * np.eye(3), attitude.shape)
-    measured = [meeting.sighting.pose_cov for meeting in meetings]
+    measured = [frame.sighting.pose_cov for frame in frames]
     of_pose = np.array([np.zeros((3, 3)) if cov is None else cov[:3, :3] for cov in measured])
     total = total + attitude @ of_pose @ np.swapaxes(attitude, 1, 2)
     unstated = _UNSTATED_SD_M**2 * np.eye(3)
@@ -126,15 +137,15 @@ def _white_m2(
 
 
 def _camera_velocity(
-    meetings: Sequence[Meeting], centre: FloatArray, otherwise: FloatArray
+    frames: Sequence[ComparedFrame], centre: FloatArray, vehicle_velocity: FloatArray
 ) -> FloatArray:
-    """Return the camera's velocity (n, 3) by splines through its positions, not across gaps.
+    """Return the camera's velocity (n, 3) by splines through its positions between gaps.
 
-    Where there is nothing to interpolate it is taken to follow the vehicle.
+    A frame without neighbours has the vehicle's velocity.
     """
-    time_s = np.array([meeting.time_s for meeting in meetings])
-    velocity = otherwise.copy()
-    breaks = np.flatnonzero(np.diff(time_s) > _NEIGHBOUR_S) + 1
+    time_s = np.array([frame.time_s for frame in frames])
+    velocity = vehicle_velocity.copy()
+    breaks = np.flatnonzero(np.diff(time_s) > _MAX_INTERVAL_S) + 1
     for run in np.split(np.arange(len(time_s)), breaks):
         if len(run) > 1 and np.all(np.diff(time_s[run]) > 0.0):
             velocity[run] = CubicSpline(time_s[run], centre[run])(time_s[run], 1)
@@ -142,7 +153,7 @@ def _camera_velocity(
 
 
 def _track(velocity: FloatArray, body: FloatArray) -> FloatArray:
-    """Return along track, across to the right and up (n, 3, 3), as rows in ENU axes."""
+    """Return unit vectors along the track, across it to the right, and up (n, 3, 3), as rows."""
     ahead = np.where(
         np.linalg.norm(velocity[:, :2], axis=1, keepdims=True) > _STANDING_M_S,
         velocity,

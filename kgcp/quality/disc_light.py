@@ -1,9 +1,9 @@
-"""Whether the light on discs and ground is what it must be: as much more on white as on ink.
+"""Test for negatives and burnt white: light must change bright levels more than dark ones.
 
-Light multiplies what a surface reflects, so that where it falls off over a photograph, bright
-levels change the most. Of a negative it is the dark ones, and where white is burnt, the bright ones
-do not change either. Then nothing tells how the light falls off over a bright level, and edges are
-taken for displaced by it: by a few hundredths of a pixel, all in one direction.
+Light multiplies what a surface reflects. Where it falls off over a photograph, bright levels
+therefore change the most. In a negative, the dark ones do; with burnt white, the bright ones do not
+change. The falloff over bright surfaces is then unknown, and is mistaken for a displacement of
+edges by a few hundredths of a pixel, all in one direction.
 """
 
 from __future__ import annotations
@@ -15,32 +15,33 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 
-_LEAST_CHANGE = 0.02  # of the dark levels: below, neither says anything
-# Bright levels over dark ones. Photographs of all sorts have 1.2 to 13, simulated negatives 0.1 to
-# 0.4 (0.9 by a film's curve, which is not told), burnt film 0.2.
-_LEAST_RATIO = 0.5
-_BURNT = 0.05  # share of clipped pixels
-_FEWEST_DISCS = 12  # for a light of second order
-_OUTLYING = 3.0  # robust deviations
+_MIN_CHANGE = 0.02  # of the dark levels, of full scale; below, the light is too even to tell
+# Least ratio of the change of bright levels to that of dark ones. It is 1.2 to 13 in photographs of
+# all sorts, 0.2 in burnt film, and 0.1 to 0.4 in simulated negatives; those with a film's curve
+# have 0.9 and are not recognised.
+_MIN_RATIO = 0.5
+_BURNT = 0.05  # median share of clipped pixels above which a photograph is burnt
+_MIN_DISCS = 12  # for light of second order
+_MAX_DEVIATION = 3.0  # of a level from the smooth light, in robust standard deviations
 
 
 @dataclass(frozen=True, slots=True)
 class DiscLight:
-    """How much the light changes the levels of discs and ground within photographs."""
+    """Smooth change of the levels of discs and ground within photographs."""
 
-    # standard deviation over a photograph of what changes smoothly, RMS of the photographs; of full
-    # scale. Burnt photographs do not count if they are fewer than half.
+    # Standard deviation of the smooth part of the levels over a photograph, as share of full scale;
+    # RMS of the photographs. Burnt photographs are left out if they are fewer than half.
     dark: float
     bright: float
-    clipped: float  # median share of clipped pixels in these; NaN: not known
+    clipped: float  # median share of clipped pixels in the same photographs; NaN: not known
 
     @property
     def doubt(self) -> str:
         """What is wrong with the light; empty: nothing."""
-        if self.dark < _LEAST_CHANGE or self.bright >= _LEAST_RATIO * self.dark:
+        if self.dark < _MIN_CHANGE or self.bright >= _MIN_RATIO * self.dark:
             return ""
-        is_whole = self.clipped <= _BURNT
-        cause = "they look like" if is_whole else "white is burnt, or they are"
+        is_unclipped = self.clipped <= _BURNT
+        cause = "they look like" if is_unclipped else "white is burnt, or they are"
         return (
             f"the light changes dark levels of the photographs by {100.0 * self.dark:.1f} % and"
             f" bright ones by {100.0 * self.bright:.1f} % only: {cause} negatives"
@@ -53,11 +54,11 @@ def light_on_discs(photographs: Iterable[tuple[FloatArray, FloatArray, FloatArra
     Parameters
     ----------
     photographs : iterable of ((k, 2) array, (k, 2) array, (k,) array)
-        Of k discs each, six or more: places [px], levels inside and outside before clipping as
-        share of full scale, and share of clipped pixels.
+        For each photograph, of k ≥ 6 discs: places [px], levels inside and outside before clipping
+        as share of full scale, and share of clipped pixels.
     """
     all_photographs = list(photographs)
-    unburnt = [each for each in all_photographs if not np.median(each[2]) > _BURNT]
+    unburnt = [photo for photo in all_photographs if not np.median(photo[2]) > _BURNT]
     considered = unburnt if 2 * len(unburnt) > len(all_photographs) else all_photographs
     changes, clipped = [], []
     for places_px, levels, share in considered:
@@ -70,19 +71,19 @@ def light_on_discs(photographs: Iterable[tuple[FloatArray, FloatArray, FloatArra
 
 
 def _terms(places_px: FloatArray) -> FloatArray:
-    """Return terms (k, 6) of second order, or (k, 3) of first order for few discs."""
+    """Return polynomial terms of second order (k, 6), or of first order (k, 3) for few discs."""
     x, y = ((places_px - places_px.mean(axis=0)) / places_px.std()).T
     linear = np.stack((np.ones_like(x), x, y), axis=1)
-    if len(x) < _FEWEST_DISCS:
+    if len(x) < _MIN_DISCS:
         return linear
     return np.column_stack((linear, x * x, x * y, y * y))
 
 
 def _smooth_change(terms: FloatArray, level: FloatArray) -> float:
-    """Return the standard deviation of what is smooth in levels (k,), outliers left out."""
-    found = np.linalg.lstsq(terms, level)[0]
-    residuals = np.abs(level - terms @ found)
-    is_near = residuals <= _OUTLYING * 1.4826 * np.median(residuals)
-    if np.count_nonzero(is_near) >= 2 * terms.shape[1]:
-        found = np.linalg.lstsq(terms[is_near], level[is_near])[0]
-    return float(np.std(terms @ found))
+    """Return the standard deviation of the smooth part of levels (k,), without outliers."""
+    coefficients = np.linalg.lstsq(terms, level)[0]
+    residuals = np.abs(level - terms @ coefficients)
+    is_inlier = residuals <= _MAX_DEVIATION * 1.4826 * np.median(residuals)
+    if np.count_nonzero(is_inlier) >= 2 * terms.shape[1]:
+        coefficients = np.linalg.lstsq(terms[is_inlier], level[is_inlier])[0]
+    return float(np.std(terms @ coefficients))

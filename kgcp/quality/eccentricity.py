@@ -1,8 +1,9 @@
-"""How far the images of discs are from the images of their centres, in numbers for a report.
+"""Distances between the centroids of discs' images and the images of their centres, for reports.
 
-The two causes are kept apart as in figures 5 and 6 of ISPRS Archives XXXVII-B1 (2008): perspective
-moves the centroid by (R²/f) ½ sin 2θ, and distortion that changes within the marker moves it again.
-Both were neglected there. `parameters_if_neglected` says what that costs an adjustment.
+There are two causes, separated as in figures 5 and 6 of ISPRS Archives XXXVII-B1 (2008).
+Perspective displaces the centroid by (R²/f) ½ sin 2θ; distortion that varies within the marker
+displaces it further. Both were neglected there. `parameters_if_neglected` returns the effect on an
+adjustment.
 """
 
 from __future__ import annotations
@@ -16,20 +17,20 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle_image import Circles3D, circle_images, eccentricity
 
 _ANGLES_DEG = np.arange(0.0, 76.0, 2.5)
-_MARGIN = 0.04  # of the frame's width, that discs stay inside it
-_COLUMNS = 13  # of places over the frame
+_MARGIN = 0.04  # least distance of discs from the border, in frame widths
+_COLUMNS = 13  # of the grid of discs over the frame
 
 
 @dataclass(frozen=True, slots=True)
 class MedianAndMax:
-    """Of some discs."""
+    """Median and largest of one quantity of some discs."""
 
     median: float
     largest: float
 
     @classmethod
     def of(cls, values: FloatArray) -> MedianAndMax:
-        """Summarise values, NaN left out."""
+        """Summarise values; NaN are ignored."""
         return cls(float(np.nanmedian(values)), float(np.nanmax(values)))
 
 
@@ -40,8 +41,8 @@ class EccentricitySummary:
     focal_px: float
     radius_px: MedianAndMax  # of the images of the discs
     tilt_deg: MedianAndMax  # of the discs against the viewing rays
-    perspective_px: MedianAndMax  # eccentricity that an ideal lens would show
-    in_marker_px: MedianAndMax  # by distortion that changes within the marker
+    perspective_px: MedianAndMax  # eccentricity with an ideal lens
+    in_marker_px: MedianAndMax  # eccentricity by distortion that varies within the marker
 
 
 def summarise_eccentricity(camera: Camera, circles: Circles3D) -> EccentricitySummary:
@@ -77,7 +78,7 @@ def eccentricity_over_angle(camera: Camera, radius_px: float) -> tuple[FloatArra
     Parameters
     ----------
     radius_px : float
-        Of the disc's image if it were seen squarely, in the middle of the frame.
+        Of the image of the disc seen frontally in the middle of the frame.
     """
     tilts = np.radians(_ANGLES_DEG)
     normals = np.column_stack((np.sin(tilts), np.zeros_like(tilts), np.cos(tilts)))
@@ -88,14 +89,14 @@ def eccentricity_over_angle(camera: Camera, radius_px: float) -> tuple[FloatArra
 
 
 def displacement_over_frame(camera: Camera, radius_px: float) -> tuple[FloatArray, FloatArray]:
-    """Return places (n, 2) and by how much distortion moves discs' centroids there (n, 2) [px].
+    """Return places (n, 2) and the displacements (n, 2) of discs' centroids by distortion [px].
 
-    Discs are square to the optical axis; places that distortion cannot reach are left out.
+    The discs are perpendicular to the optical axis. Pixels without a ray are left out.
 
     Parameters
     ----------
     radius_px : float
-        Of their images in the middle of the frame.
+        Of the discs' images in the middle of the frame.
     """
     rows = max(2, round(_COLUMNS * camera.height / camera.width))
     margin = _MARGIN * camera.width
@@ -113,18 +114,18 @@ def displacement_over_frame(camera: Camera, radius_px: float) -> tuple[FloatArra
 def parameters_if_neglected(
     jacobian: FloatArray, weights: FloatArray, shifts_px: FloatArray
 ) -> FloatArray:
-    """Return by how much the parameters (p,) of an adjustment change if discs' centres are shifted.
+    """Return the changes of an adjustment's parameters (p,) if discs' centres are shifted.
 
-    One linear step: (JᵀWJ)⁻¹ JᵀW δ.
+    They follow from one linear step: (JᵀWJ)⁻¹ JᵀW δ.
 
     Parameters
     ----------
     jacobian : (m, p) array
         Derivatives of all image coordinates.
     weights : (m,) array
-        Their inverse variances.
+        Inverse variances of the image coordinates.
     shifts_px : (m,) array
-        What is neglected, such as `Eccentricity.total_px`.
+        Neglected shifts, such as `Eccentricity.total_px`.
     """
     root = np.sqrt(weights)
     scale = np.linalg.norm(jacobian * root[:, None], axis=0)

@@ -1,4 +1,4 @@
-"""Residuals of a flight's distances as arrays, with what may explain them."""
+"""Residuals of a flight's distances, with the quantities that may explain them, as arrays."""
 
 from __future__ import annotations
 
@@ -12,25 +12,26 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.quality.bias_study import Comparison
 from kgcp.quality.robust_gls import ErrorModel
 
-ROUNDING = 1e-9  # a quantity that varies by less does not vary
-# Without stated standard deviations the scatter sets the scale, and these only the proportions.
+ROUNDING = 1e-9  # a quantity that varies by less counts as constant
+# Standard deviations where none are stated: of an edge, and of independent and correlated errors of
+# the reference. They set proportions only; the scatter of the residuals sets the scale.
 _UNSTATED_EDGE_PX = 0.05
-_UNSTATED_WHITE_M, _UNSTATED_LASTING_M = 0.005, 0.01
+_UNSTATED_INDEPENDENT_M, _UNSTATED_CORRELATED_M = 0.005, 0.01
 
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """One thing that an exposure may act by."""
+    """A quantity by which exposure may displace edges."""
 
     name: str  # of the column
-    label: str  # what it is, with its unit
-    per: str  # of what one unit is called in the regression
-    is_log: bool = False  # whether factors count, not differences: then the unit is a factor of two
-    # whether 0 means that nothing is displaced; of others only changes can be told
+    label: str  # with its unit
+    per: str  # name of one unit in the regression
+    is_log: bool = False  # whether its logarithm counts; the unit is then a factor of two
+    # whether edges are not displaced at 0; for others, only the effect of changes is determined
     is_absolute: bool = False
 
     def measure(self, values: FloatArray) -> FloatArray:
-        """Return values (n,) in the regression's unit; NaN where there is none."""
+        """Return values (n,) in the regression's unit; NaN if missing or not positive."""
         if not self.is_log:
             return values
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -48,19 +49,18 @@ QUANTITIES = (
     Quantity("black", "level of black", "full range"),
     Quantity("f_number", "f-number", "doubling", is_log=True),
 )
-"""In the order in which they are believed: of those that look alike the last is given up."""
+"""Likeliest first: of quantities that cannot be separated, the last is not estimated."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DistanceResiduals:
-    """Residuals of n distances, with all that may explain them, in the order of time."""
+    """Residuals of n distances and the quantities that may explain them, in the order of time."""
 
-    # (n,): reference distance, and the radius in the image that gave the measured one
-    distance_m: FloatArray
-    radius_px: FloatArray
+    distance_m: FloatArray  # (n,): reference distances
+    radius_px: FloatArray  # (n,): radii in the image from which distances were measured
     residual_m: FloatArray  # (n,): measured minus reference distance
     errors: ErrorModel  # of the residuals, in m²
-    # the columns of `QUANTITIES` by name; NaN where a frame has none
+    # (n,) each: the columns of `QUANTITIES` by name; NaN: not known in a frame
     exposure: dict[str, FloatArray]
 
     @classmethod
@@ -70,14 +70,14 @@ class DistanceResiduals:
         measured_m: FloatArray,
         radius_px: FloatArray | None = None,
     ) -> Self:
-        """Collect comparisons with a measurement, `in_time`.
+        """Collect comparisons with a measurement, sorted by `in_time`.
 
         Parameters
         ----------
         measured_m : (n,) array
             Measured distances [m].
         radius_px : (n,) array, optional
-            Radii that gave them; those of the detections if not given.
+            Radii from which they were measured.  [default: those of the detections]
         """
         distance = np.array([pair.reference_distance_m for pair in compared])
         radius = radius_px
@@ -101,7 +101,7 @@ class DistanceResiduals:
 
 
 def in_time(compared: Sequence[Comparison]) -> list[Comparison]:
-    """Sort comparisons by time, those without one by their frames' names behind the others."""
+    """Sort comparisons by time; those without a time follow, by the names of their frames."""
     return sorted(
         compared,
         key=lambda pair: (
@@ -129,13 +129,15 @@ def _error_model(compared: Sequence[Comparison], unstated_m: FloatArray) -> Erro
         ]
     )
     independent = np.array(
-        [pair.sds.independent_m if pair.sds else _UNSTATED_WHITE_M for pair in compared]
+        [pair.sds.independent_m if pair.sds else _UNSTATED_INDEPENDENT_M for pair in compared]
     )
-    place = np.array([pair.sds.place_m if pair.sds else _UNSTATED_LASTING_M for pair in compared])
+    trajectory = np.array(
+        [pair.sds.trajectory_m if pair.sds else _UNSTATED_CORRELATED_M for pair in compared]
+    )
     times = np.array([pair.attempt.time_s for pair in compared], dtype=np.float64)
-    if not np.isfinite(times).all():  # without times it is not known which are neighbours
+    if not np.isfinite(times).all():  # without times, correlations are unknown
         times = np.arange(float(len(independent)))
         return ErrorModel(
-            measured**2 + independent**2 + place**2, np.zeros_like(independent), times
+            measured**2 + independent**2 + trajectory**2, np.zeros_like(independent), times
         )
-    return ErrorModel(measured**2 + independent**2, place**2, times)
+    return ErrorModel(measured**2 + independent**2, trajectory**2, times)

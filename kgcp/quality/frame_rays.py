@@ -1,7 +1,7 @@
-"""Rays over a frame: how well they are known, and how those of two cameras differ.
+"""Rays of a camera over the frame: their standard deviations, and differences between cameras.
 
-A shift of the principal point and a turn of the camera look nearly the same. What a user of a
-camera meets is what is left after the best turn.
+A shift of the principal point has nearly the same effect as a rotation of the camera, and every
+orientation absorbs rotations. What matters to a user is therefore what the best rotation leaves.
 """
 
 from __future__ import annotations
@@ -23,14 +23,15 @@ _GRID = 25  # points along the longer side of the frame
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraDifference:
-    """How another camera images the rays of a camera, apart from a turn."""
+    """Difference between two cameras' images of the same rays, apart from a rotation."""
 
-    pixels: FloatArray  # (n, 2) [px]
-    shifts_px: FloatArray  # (n, 2): NaN where the model has no ray
+    pixels: FloatArray  # (n, 2): of the first camera [px]
+    # (n, 2): pixel of the same ray in the other camera, minus this one; NaN: no ray
+    shifts_px: FloatArray
 
     @property
     def sizes_px(self) -> FloatArray:
-        """Lengths of the shifts that there are."""
+        """Lengths of the shifts, without NaN [px]."""
         sizes = np.linalg.norm(self.shifts_px, axis=1)
         return np.asarray(sizes[np.isfinite(sizes)])
 
@@ -49,11 +50,12 @@ class CameraDifference:
 class _Rays:
     """A grid of pixels and their rays."""
 
-    shape: tuple[int, int]
+    shape: tuple[int, int]  # rows and columns
     pixels: FloatArray  # (n, 2)
-    normalised: FloatArray  # (n, 2): zeros where there is no ray
-    is_there: BoolArray  # (n,)
-    by_turn: FloatArray  # (2k, 3): orthonormal, of the k rays that there are
+    normalised: FloatArray  # (n, 2): zeros without a ray
+    has_ray: BoolArray  # (n,)
+    # (2k, 3): orthonormal basis of the displacements of the k pixels with a ray by rotations
+    rotation_basis: FloatArray
 
     @classmethod
     def of(cls, camera: Camera) -> _Rays:
@@ -63,39 +65,39 @@ class _Rays:
         x, y = np.meshgrid(across, np.linspace(0.0, camera.height - 1.0, rows))
         pixels = np.column_stack((x.ravel(), y.ravel()))
         normalised = camera.undistort(pixels)
-        is_there = np.all(np.isfinite(normalised), axis=1)
-        normalised = np.where(is_there[:, None], normalised, 0.0)
+        has_ray = np.all(np.isfinite(normalised), axis=1)
+        normalised = np.where(has_ray[:, None], normalised, 0.0)
         u, v = normalised.T
         turns = np.stack((u * v, -(1.0 + u * u), v, 1.0 + v * v, -u * v, -u), axis=1)
         by_turn = camera.distort_jacobian(normalised) @ turns.reshape(-1, 2, 3)
-        basis = np.linalg.qr(by_turn[is_there].reshape(-1, 3))[0]
-        return cls((rows, _GRID), pixels, normalised, is_there, basis)
+        basis = np.linalg.qr(by_turn[has_ray].reshape(-1, 3))[0]
+        return cls((rows, _GRID), pixels, normalised, has_ray, basis)
 
-    def without_turn(self, moved: FloatArray) -> FloatArray:
-        """Return what (n, 2, …) is left of movements of the pixels, zeros where there is no ray."""
-        kept = moved[self.is_there].reshape(2 * int(np.count_nonzero(self.is_there)), -1)
-        left = np.zeros_like(moved)
-        rest = kept - self.by_turn @ (self.by_turn.T @ kept)
-        left[self.is_there] = rest.reshape(-1, *moved.shape[1:])
-        return left
+    def without_rotation(self, displacements: FloatArray) -> FloatArray:
+        """Return displacements (n, 2, …) of the pixels minus the best rotation; 0 without a ray."""
+        kept = displacements[self.has_ray].reshape(2 * int(np.count_nonzero(self.has_ray)), -1)
+        residuals = np.zeros_like(displacements)
+        residuals_of_kept = kept - self.rotation_basis @ (self.rotation_basis.T @ kept)
+        residuals[self.has_ray] = residuals_of_kept.reshape(-1, *displacements.shape[1:])
+        return residuals
 
 
 def ray_deviations_px(camera: Camera, covariance: CalibrationCovariance) -> FloatArray:
-    """Return the standard deviation (h, w) of every ray of a grid over the frame [px]."""
+    """Return the standard deviations (h, w) of rays on a grid over the frame [px]."""
     rays = _Rays.of(camera)
     by_camera = distort_jacobian_by_calibration(camera, rays.normalised)
-    left = rays.without_turn(by_camera).reshape(-1, len(CALIBRATION_PARAMETERS))
-    variances = np.einsum("ij,jk,ik->i", left, covariance.cov, left)
+    jacobian = rays.without_rotation(by_camera).reshape(-1, len(CALIBRATION_PARAMETERS))
+    variances = np.einsum("ij,jk,ik->i", jacobian, covariance.cov, jacobian)
     sd = np.sqrt(np.maximum(variances, 0.0).reshape(-1, 2).sum(axis=1))
-    return np.asarray(np.where(rays.is_there, sd, np.nan).reshape(rays.shape))
+    return np.asarray(np.where(rays.has_ray, sd, np.nan).reshape(rays.shape))
 
 
 def compare_cameras(camera: Camera, other: Camera) -> CameraDifference:
     """Return where another camera images the rays of a camera, minus where this one does.
 
-    Both are of the same frame size.
+    Both must have the same frame size.
     """
     rays = _Rays.of(camera)
-    shifts = rays.without_turn(other.distort(rays.normalised) - rays.pixels)
-    is_there = rays.is_there[:, None]
-    return CameraDifference(rays.pixels, np.where(is_there, shifts, np.nan))
+    shifts = rays.without_rotation(other.distort(rays.normalised) - rays.pixels)
+    has_ray = rays.has_ray[:, None]
+    return CameraDifference(rays.pixels, np.where(has_ray, shifts, np.nan))

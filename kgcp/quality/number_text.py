@@ -1,4 +1,4 @@
-"""Numbers in print: signs, plurals, and as many digits as their standard deviations deserve."""
+"""Numbers as text: signs, plurals, and digits by the standard deviation."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 
 def counted(count: int, noun: str) -> str:
-    """Return a count with its noun, in the plural where it must be."""
+    """Return a count with its noun, in the plural unless it is 1."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
@@ -16,19 +16,19 @@ def minus(number: str) -> str:
 
 
 def rounded(value: float) -> str:
-    """Return a number of two digits, or as a whole number, never with an exponent."""
+    """Return a number with two significant digits, from 100 on as a whole number."""
     return f"{value:.2g}" if abs(value) < 99.5 else f"{value:.0f}"
 
 
 def amount(value: float, sd: float | None, sign: str = "") -> str:
-    """Return value ± standard deviation, both to the second digit of the latter.
+    """Return value ± standard deviation, both rounded to the second digit of the latter.
 
     Parameters
     ----------
-    value, sd : float
-        None or 0: the standard deviation is not known.
+    sd : float or None
+        None or 0: not known.
     sign : str
-        As in a format: "+" prints the sign of positive values, too.
+        As in a format specification: "+" prints the sign of positive values, too.
     """
     if sd is None or not sd > 0.0:
         return f"{value:{sign}.3g}"

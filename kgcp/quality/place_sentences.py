@@ -1,4 +1,4 @@
-"""What placed targets say about flight.toml, in sentences."""
+"""Sentences that compare placed targets with flight.toml."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from kgcp.georef.scene_rotation import CameraMotions
 from kgcp.network.ground.target_places import PlacedTarget, Placement
 from kgcp.quality.number_text import minus, rounded
 
-_DOUBTFUL = 3.0  # standard deviations
-_DOUBTFUL_CHI2 = 14.2  # of three coordinates, as likely as 3 standard deviations of one
-_LEAST_EXTRA_PX = 0.005  # of what is worth a sentence
+_MAX_RATIO = 3.0  # of a diameter's residual to its standard deviation
+_MAX_CHI2 = 14.2  # of three coordinates, as likely as 3 standard deviations of one
+_MIN_NOISE_PX = 0.005  # of additional noise that is reported
 
 
 def has_other_diameter(placed: PlacedTarget) -> bool:
-    """Tell whether a ring is not as large as flight.toml says."""
-    return _diameter_ratio(placed) > _DOUBTFUL
+    """Tell whether a ring's diameter contradicts flight.toml."""
+    return _diameter_ratio(placed) > _MAX_RATIO
 
 
 def lies_elsewhere(placed: PlacedTarget) -> bool:
-    """Tell whether a target does not lie where flight.toml says."""
+    """Tell whether a target's position contradicts flight.toml."""
     chi2 = placed.check.position_chi2
-    return chi2 is not None and chi2 > _DOUBTFUL_CHI2
+    return chi2 is not None and chi2 > _MAX_CHI2
 
 
 def _diameter_ratio(placed: PlacedTarget) -> float:
@@ -36,7 +36,7 @@ def _diameter_ratio(placed: PlacedTarget) -> float:
 
 
 def diameter_sentence(placed: PlacedTarget) -> str:
-    """Return how large a ring is, against what flight.toml states."""
+    """Return the sentence on a ring's diameter, compared with flight.toml."""
     check = placed.check
     sd = placed.sd_diameter_m
     decimals = 4 if not sd > 0.0 else min(7, max(4, 1 - math.floor(math.log10(sd))))
@@ -51,22 +51,22 @@ def diameter_sentence(placed: PlacedTarget) -> str:
 
 
 def position_sentence(placed: PlacedTarget) -> str:
-    """Return where a target lies, against the position that flight.toml states."""
+    """Return the sentence on a target's position, compared with flight.toml."""
     check = placed.check
     chi2 = check.position_chi2
     if check.residual_m is None or chi2 is None:
         return f"{placed.target}: flight.toml states no position"
     x, y, z = (minus(f"{value:+.4f}") for value in check.residual_m.tolist())
     is_doubtful = lies_elsewhere(placed)
-    verdict = "more than its deviations explain" if is_doubtful else "as expected"
+    verdict = "more than the standard deviations explain" if is_doubtful else "as expected"
     return (
         f"{placed.target}: lies {x}, {y}, {z} m (x, y, z) from its position in flight.toml,"
-        f" {verdict} (χ² {chi2:.1f} of 3)"
+        f" {verdict} (χ² = {chi2:.1f} for 3 coordinates)"
     )
 
 
 def doubts_of(placed: PlacedTarget) -> Iterator[str]:
-    """Yield what to look at before a placed target is used."""
+    """Yield the doubts about a placed target."""
     rejected = int(np.count_nonzero(~placed.is_used))
     if placed.move is not None:
         yield (
@@ -84,8 +84,8 @@ def doubts_of(placed: PlacedTarget) -> Iterator[str]:
     if placed.own_noise_px is not None:
         yield (
             f"{placed.target}: its images contradict each other by {placed.own_noise_px:.3g} px,"
-            " those of other targets do not: it was moved, or something else was taken for it;"
-            " its place lies between, and is stated as uncertain as that of a single frame"
+            " those of other targets do not: it was moved, or something else was mistaken for it;"
+            " its place is an average, with the standard deviation of a single frame"
         )
     if placed.ambiguity < MIN_AMBIGUITY:
         yield (
@@ -95,30 +95,28 @@ def doubts_of(placed: PlacedTarget) -> Iterator[str]:
 
 
 def step_sentence(placement: Placement) -> str:
-    """Return that reference poses seem to step, or a single target to move; empty if none does."""
+    """Return the sentence on a step of the reference poses or of a target; empty: no step."""
     stepped = [(each.target, each.step) for each in placement.targets if each.step is not None]
     if not stepped:
         return ""
     target, step = max(stepped, key=lambda each: each[1].distance_m)
-    images = (
-        f"from {step.frame} on, its images show another place, by about {rounded(step.distance_m)}"
-    )
+    images = f"from {step.frame} on, its images show a place about {rounded(step.distance_m)}"
     if len(stepped) == 1:
         return (
-            f"{target}: {images} m: the reference poses step or drift, or it was moved, which one"
-            " target alone does not tell; its place lies between, and is stated as uncertain as"
-            " that of a single frame"
+            f"{target}: {images} m away: the reference poses step or drift, or the target was"
+            " moved; one target alone does not tell which; its place is an average, with the"
+            " standard deviation of a single frame"
         )
     names = ", ".join(name for name, _ in stepped)
     return (
-        f"the reference poses step or drift, {names} seem to move alike: of {target},"
-        f" {images} m; their places lie between, and are stated as uncertain as those of a single"
+        f"the reference poses step or drift, because {names} seem to move alike; {target}:"
+        f" {images} m away; their places are averages, with the standard deviations of a single"
         " frame"
     )
 
 
 def noise_sentence(placement: Placement) -> str:
-    """Return by how much the residuals exceed the stated deviations; empty if hardly."""
+    """Return the sentence on residuals beyond the stated deviations; empty if they are small."""
     noise = placement.noise
     parts = [
         f"{value:.3f} px in {what}"
@@ -126,19 +124,22 @@ def noise_sentence(placement: Placement) -> str:
             (noise.centre_px, "the places (mostly of the reference poses)"),
             (noise.outline_px, "size and shape"),
         )
-        if value > _LEAST_EXTRA_PX
+        if value > _MIN_NOISE_PX
     ]
     if not parts:
         return ""
-    return f"the images deviate by more than is stated: {' and '.join(parts)}; this is allowed for"
+    return (
+        "the images deviate by more than the stated standard deviations:"
+        f" {' and '.join(parts)}; this is taken into account"
+    )
 
 
 def motion_sentence(motions: CameraMotions | None, camera: Camera) -> str:
-    """Return that nothing tells a rolling shutter's motion; empty: it is told, or there is none."""
+    """Return the sentence on an unknown motion with a rolling shutter; empty: known, or global."""
     if motions is None or motions.is_observed.any():
         return ""
     return (
-        "poses and times do not tell how the camera moves while its rolling shutter reads a"
+        "poses and times do not determine how the camera moves while its rolling shutter reads a"
         f" frame: the standard deviations assume {camera.motion_sd_deg_s:g}°/s (motion_sd_deg_s);"
-        " give times to the frames"
+        " give the frames' times"
     )

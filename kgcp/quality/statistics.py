@@ -1,4 +1,4 @@
-"""Numbers that describe residuals: spread, moving statistics, rates, slopes."""
+"""Statistics of residuals: spread, moving statistics, rates, slopes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.quality.robust_gls import ErrorModel, fit, two_sided
+from kgcp.quality.robust_gls import ErrorModel, fit, two_sided_probability
 
 _Z_95 = 1.959963984540054
 _MIN_IN_WINDOW = 3
@@ -24,7 +24,7 @@ class Spread:
     count: int  # at least 1
     # in the values' unit
     mean: float
-    sd: float | None  # of one value, with count − 1; None for a single value
+    sd: float | None  # of one value, with count − 1 degrees of freedom; None for a single value
     rms: float
 
     @classmethod
@@ -44,17 +44,16 @@ class Spread:
 class MovingStatistics:
     """Mean and standard deviation in a window that moves along x (the paper's Figure 9)."""
 
-    # (n,): window centres, and the values' statistics in each; NaN where a window holds fewer than
-    # three values
-    centre: FloatArray
+    centre: FloatArray  # (n,): of the windows, along x
+    # (n,): of the values in each window; NaN: fewer than three values
     mean: FloatArray
     sd: FloatArray
 
 
 def moving_statistics(x: FloatArray, y: FloatArray, window: float) -> MovingStatistics:
-    """Return mean and standard deviation of y (n,) within ± window/2 of x, by steps of window/10.
+    """Return mean and standard deviation of y (n,) in windows along x (n,), in steps of window/10.
 
-    n ≥ 1, all finite.
+    All values must be finite, and n ≥ 1.
     """
     step = window / 10.0
     first, last = math.floor(x.min() / step), math.ceil(x.max() / step)
@@ -89,7 +88,7 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 class Slope:
     """A line y = height + value · (x − middle)."""
 
-    count: int  # points that took part; those far off the line did not
+    count: int  # fitted points, without outliers
     middle: float
     height: float
     value: float
@@ -97,8 +96,7 @@ class Slope:
     sd_height: float
     sd_value: float
     probability: float  # of as large a slope by chance
-    # of the variance of y that the line explains, corrected for its one parameter
-    share: float
+    share: float  # of the variance of y that the line explains, corrected for its one parameter
 
     def line(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the line at x (n,) and its standard deviation."""
@@ -109,14 +107,14 @@ class Slope:
 def fit_slope(
     x: FloatArray, y: FloatArray, sd: FloatArray, *, is_robust: bool = True
 ) -> Slope | None:
-    """Fit a line to points (n,); None where x says little.
+    """Fit a line to points (n,); None if there are too few, or if x or y do not vary.
 
     Parameters
     ----------
     sd : (n,) array
-        Standard deviations of y but for a common factor, which is that of the scatter.
+        Standard deviations of y; their scale is estimated from the scatter.
     is_robust : bool
-        Whether to leave out points that are far off the others.
+        Whether outliers are left out.
     """
     if len(x) < _MIN_COUNT or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
         return None
@@ -131,7 +129,7 @@ def fit_slope(
     share = 1.0 - (result.chi2 / result.freedom) / (result.chi2_of([0]) / (result.freedom + 1))
     height, value = result.values.tolist()
     sd_height, sd_value = result.sds.tolist()
-    chance = two_sided(value / sd_value, result.freedom)
+    chance = two_sided_probability(value / sd_value, result.freedom)
     return Slope(
         int(kept.sum()), middle, height, value, sd_height, sd_value, chance, max(0.0, share)
     )

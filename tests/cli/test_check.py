@@ -100,7 +100,7 @@ def _exchange_columns(flight: Path) -> None:
         (_exchange_columns, "with x and y exchanged it fits", 1),
         (
             lambda flight: change(flight, "frames.csv", "T08:", "T10:"),
-            "2 h earlier all would lie inside",
+            "2 h earlier, all would lie inside",
             1,
         ),
         (

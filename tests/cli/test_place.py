@@ -72,7 +72,10 @@ def test_a_rolling_shutter_needs_times(tmp_path: Path) -> None:
     settings.write_text(text.replace("[camera]", "[camera]\nreadout_s = 0.03"), encoding="utf-8")
     result = run(folder, "--json")
     assert result.exit_code == 0, result.stderr
-    assert "the standard deviations assume 5°/s (motion_sd_deg_s); give times" in result.stderr
+    assert (
+        "the standard deviations assume 5°/s (motion_sd_deg_s); give the frames' times"
+        in result.stderr
+    )
     target = json.loads(result.stdout)["targets"][0]
     assert target["sd_position_m"][2] > 5.0 * still["sd_position_m"][2]
     assert target["frames_used"] == 12
@@ -206,7 +209,7 @@ def test_poses_that_step_move_no_target(
     assert "was moved by" not in result.stderr
     assert "the reference poses step or drift" in result.stderr
     assert f"from f_{frames:03d}.png on" in result.stderr
-    assert ("or it was moved" in result.stderr) == (len(names) == 1)
+    assert ("or the target was moved" in result.stderr) == (len(names) == 1)
     found = places_of(folder)
     for name, true in zip(names, flight.positions_map, strict=True):
         z = (found[name][:3] - true - [0.5 * size_m, 0.0, 0.0]) / found[name][3:6]

@@ -60,7 +60,7 @@ def test_a_layout_that_is_hard_to_find_is_told(flight: Path) -> None:
     (flight / "flight.toml").write_text(text, encoding="utf-8")
     result = run(flight, "--height", "40")
     assert result.exit_code == 0
-    assert result.stderr.startswith("kgcp: doubt: the inner diameter of 'A' is 0.33 of the outer")
+    assert result.stderr.startswith("kgcp: doubt: the inner diameter of 'A' is 0.33 times the")
     assert result.stderr.count("\n") == 1
 
 

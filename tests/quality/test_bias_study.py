@@ -101,7 +101,7 @@ def test_residuals_are_measured_minus_reference() -> None:
         assert one.expected_radius_px == pytest.approx(0.45 * 2300.0 / above)
         assert one.sds is not None
         assert one.sds.independent_m == pytest.approx(0.04, rel=1e-3)
-        assert one.sds.place_m == pytest.approx(0.03, rel=1e-3)
+        assert one.sds.trajectory_m == pytest.approx(0.03, rel=1e-3)
         assert one.sds.common_m == 0.0
         assert one.sds.total_m == pytest.approx(0.05, rel=1e-3)
 
@@ -209,7 +209,7 @@ def test_errors_that_all_frames_share_stand_apart() -> None:
     sds = study.measured[0].sds
     assert sds is not None
     assert sds.common_m == pytest.approx(0.02, rel=1e-3)  # what is horizontal does not count
-    assert sds.place_m == pytest.approx(0.03, rel=1e-3)
+    assert sds.trajectory_m == pytest.approx(0.03, rel=1e-3)
 
 
 def test_of_a_static_target_all_of_its_place_is_shared() -> None:
@@ -221,7 +221,7 @@ def test_of_a_static_target_all_of_its_place_is_shared() -> None:
     )
     sds = study.measured[0].sds
     assert sds is not None
-    assert sds.place_m == 0.0
+    assert sds.trajectory_m == 0.0
     assert sds.common_m == pytest.approx(0.05, rel=0.01)
 
 

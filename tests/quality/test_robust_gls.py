@@ -11,8 +11,8 @@ from kgcp.quality.robust_gls import (
     ErrorModel,
     find_outliers,
     fit,
-    separable,
-    two_sided,
+    separable_unknowns,
+    two_sided_probability,
     whitened_products,
 )
 from kgcp.quality.statistics import fit_slope
@@ -99,11 +99,11 @@ def test_of_unknowns_that_look_alike_the_last_is_given_up() -> None:
     rng = np.random.default_rng(11)
     design = rng.normal(size=(50, 4))
     design[:, 2] = design[:, 0] - 2.0 * design[:, 1] + 1e-4 * rng.normal(size=50)
-    active, groups = separable(design.T @ design, [0, 1, 2, 3], [100.0] * 4)
+    active, groups = separable_unknowns(design.T @ design, [0, 1, 2, 3], [100.0] * 4)
     assert active == [0, 1, 3]
     assert groups == [frozenset({0, 1, 2})]
-    assert separable(design.T @ design, [2, 3], [100.0] * 4) == ([2, 3], [])
-    assert separable(design.T @ design, range(4), [1e12] * 4) == ([0, 1, 2, 3], [])
+    assert separable_unknowns(design.T @ design, [2, 3], [100.0] * 4) == ([2, 3], [])
+    assert separable_unknowns(design.T @ design, range(4), [1e12] * 4) == ([0, 1, 2, 3], [])
 
 
 def test_outliers_do_not_decide() -> None:
@@ -148,5 +148,5 @@ def test_holm_lies_between_the_single_test_and_bonferroni(probabilities: list[fl
 
 def test_holm_and_student_as_in_tables() -> None:
     assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
-    assert two_sided(2.228, 10) == pytest.approx(0.05, abs=1e-4)
-    assert two_sided(-3.169, 10) == pytest.approx(0.01, abs=1e-4)
+    assert two_sided_probability(2.228, 10) == pytest.approx(0.05, abs=1e-4)
+    assert two_sided_probability(-3.169, 10) == pytest.approx(0.01, abs=1e-4)

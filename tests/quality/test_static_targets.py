@@ -87,7 +87,7 @@ def test_prints_that_are_all_wrong_alike_raise_no_doubt_up_to_two_percent() -> N
     flight = GroundFlight(stated_diameter_m=0.45)
     (doubt,) = check(seen(flight), stated(flight))
     assert doubt.code is Cause.DISTANCE_SCALE
-    assert "50 % nearer to each other" in doubt.sentence
+    assert "50 % closer to each other" in doubt.sentence
 
 
 @pytest.mark.parametrize("off_m", [0.3, 3.0])
@@ -154,7 +154,7 @@ def test_two_targets_contradict_each_other() -> None:
     (doubt,) = check(seen(flight), stated(flight, np.outer([0, 1], [1.0, 0.0, 0.0])))
     assert "A and B contradict most others" in doubt.sentence
     (doubt,) = check(seen(flight), {name: stated(flight)["A"] for name in "AB"})
-    assert "8 m further from each other" in doubt.sentence
+    assert "8 m farther from each other" in doubt.sentence
 
 
 @pytest.mark.parametrize("factor", [-1.0, 1.0])

@@ -1,4 +1,4 @@
-"""Whether a camera's numbers can be those of a frame camera, in pixels."""
+"""Check of a camera's parameters: whether they can be those of a frame camera, in pixels."""
 
 from __future__ import annotations
 
@@ -7,22 +7,25 @@ from collections.abc import Iterator
 from kgcp.geometry.camera import Camera
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
 
-_WIDEST = 0.2  # fx over the width: 136 degrees, beyond lenses of this distortion model
-_LONGEST = 30.0  # a lens of 1000 mm on small format
-_MIDDLE = 1.0 / 3.0, 2.0 / 3.0
-_SQUARE = 0.9  # no sensor has pixels less square
-_SIZE_TOLERANCE = 0.12  # how far off the centre a principal point may be, in frame sizes
+# Credible focal lengths: the least over the longer side of the frame, which is a field of view of
+# 136°, beyond lenses of this distortion model; the largest over the shorter side, a lens of 1000 mm
+# on small format.
+_MIN_FOCAL_RATIO = 0.2
+_MAX_FOCAL_RATIO = 30.0
+_MIDDLE_THIRD = 1.0 / 3.0, 2.0 / 3.0
+_MIN_ASPECT = 0.9  # of pixels; no sensor has less square ones
+_MAX_OFF_CENTRE = 0.12  # of a principal point, in frame sizes
 
 
 def check_camera(camera: Camera, *, is_guessed: bool = False) -> Iterator[Doubt]:
-    """Tell focal lengths in millimetres, principal points of other frames, and mere guesses."""
+    """Yield doubts about focal lengths in millimetres, wrong principal points, and guesses."""
     yield from _check_focal_length(camera)
     yield from _check_principal_point(camera)
     if is_guessed:
         yield mild(
             Cause.GUESSED_CAMERA,
             f"the camera is a guess from EXIF (fx = {camera.fx:g} px), not a calibration: distances"
-            " may be wrong by some per cent",
+            " may be wrong by several per cent",
             "give a calibration under [camera], and delete guessed and the sd_ keys of the guess",
             {"fx_px": camera.fx},
         )
@@ -31,34 +34,34 @@ def check_camera(camera: Camera, *, is_guessed: bool = False) -> Iterator[Doubt]
 def _check_focal_length(camera: Camera) -> Iterator[Doubt]:
     share = min(camera.fx, camera.fy) / max(camera.width, camera.height)
     figures = {"fx_px": camera.fx, "fy_px": camera.fy}
-    if share < _WIDEST:
+    if share < _MIN_FOCAL_RATIO:
         yield grave(
             Cause.FOCAL_LENGTH,
-            f"fx = {camera.fx:g}, fy = {camera.fy:g} px is too short for frames of"
-            f" {camera.width} px: is this in millimetres?",
+            f"fx = {camera.fx:g}, fy = {camera.fy:g} px are too short for frames of"
+            f" {camera.width} px: are they in millimetres?",
             "divide the focal length in mm by the size of a pixel in mm",
             figures,
         )
-    elif max(camera.fx, camera.fy) / min(camera.width, camera.height) > _LONGEST:
+    elif max(camera.fx, camera.fy) / min(camera.width, camera.height) > _MAX_FOCAL_RATIO:
         yield grave(
             Cause.FOCAL_LENGTH,
-            f"fx = {camera.fx:g}, fy = {camera.fy:g} px is too long for frames of"
-            f" {camera.width} px: is this in micrometres?",
+            f"fx = {camera.fx:g}, fy = {camera.fy:g} px are too long for frames of"
+            f" {camera.width} px: are they in micrometres?",
             "give the focal length in pixels",
             figures,
         )
-    elif min(camera.fx, camera.fy) < _SQUARE * max(camera.fx, camera.fy):
+    elif min(camera.fx, camera.fy) < _MIN_ASPECT * max(camera.fx, camera.fy):
         yield mild(
             Cause.FOCAL_LENGTH,
-            f"fx = {camera.fx:g} and fy = {camera.fy:g} px differ as those of no sensor with"
-            " square pixels",
+            f"fx = {camera.fx:g} and fy = {camera.fy:g} px differ by more than those of any sensor"
+            " with square pixels",
             "look both up in the calibration",
             figures,
         )
 
 
 def _check_principal_point(camera: Camera) -> Iterator[Doubt]:
-    low, high = _MIDDLE
+    low, high = _MIDDLE_THIRD
     x, y = camera.cx / camera.width, camera.cy / camera.height
     if low <= x <= high and low <= y <= high:
         return
@@ -68,7 +71,7 @@ def _check_principal_point(camera: Camera) -> Iterator[Doubt]:
         f" frame of {camera.width} x {camera.height} px"
     )
     for scale, word in ((2.0, "double"), (0.5, "half"), (4.0, "four times the"), (0.25, "quarter")):
-        if max(abs(x / scale - 0.5), abs(y / scale - 0.5)) < _SIZE_TOLERANCE:
+        if max(abs(x / scale - 0.5), abs(y / scale - 0.5)) < _MAX_OFF_CENTRE:
             yield grave(
                 Cause.CALIBRATION_SIZE,
                 f"{sentence}, but in the middle of one of {word} size",
@@ -78,15 +81,15 @@ def _check_principal_point(camera: Camera) -> Iterator[Doubt]:
             )
             return
     is_exchanged = all(
-        abs(value - 0.5) < _SIZE_TOLERANCE
+        abs(value - 0.5) < _MAX_OFF_CENTRE
         for value in (camera.cy / camera.width, camera.cx / camera.height)
     )
     if is_exchanged:
         remedy = "exchange cx and cy, or width and height, in [camera]"
     elif max(abs(camera.cx), abs(camera.cy)) < 0.05 * camera.width:
         remedy = (
-            "give it in pixels from the centre of the top-left pixel; offsets from the frame's"
-            " centre in mm are divided by the size of a pixel and added to half the frame's size"
+            "give it in pixels from the centre of the top-left pixel: divide offsets from the"
+            " frame's centre in mm by the size of a pixel, and add half the frame's size"
         )
     else:
         remedy = "look cx and cy up in the calibration, in pixels from the top-left pixel"

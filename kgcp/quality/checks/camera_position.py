@@ -1,4 +1,4 @@
-"""The frames' own GPS positions and altitudes against vehicle, points and distances."""
+"""Checks of the frames' own GPS positions and altitudes against vehicle, points and distances."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from kgcp.quality.checks.frame_header import FrameHeader
 from kgcp.quality.checks.place import place_text
 
 _EARTH_M = 6.37e6
-_FAR_M = 2000.0  # between a drone and the vehicle that it flies over
-_RATIO_TOLERANCE = 0.2
-_MIN_ALTITUDE_M = 3.0
+_MAX_DISTANCE_M = 2000.0  # between a drone and the vehicle below it
+_RATIO_TOLERANCE = 0.2  # relative
+_MIN_ALTITUDE_M = 3.0  # above take-off, of frames that are compared
 
 
 def check_camera_position(
@@ -25,7 +25,7 @@ def check_camera_position(
     Parameters
     ----------
     where : str
-        What the places are of: "the trajectory".
+        Subject of the sentence: "the trajectory".
     """
     camera = np.array(
         [
@@ -41,7 +41,7 @@ def check_camera_position(
     ground = np.median(ground_lonlat, axis=0)
     extent_m = float(np.linalg.norm(_metres(np.ptp(ground_lonlat, axis=0), ground)))
     off_m = float(np.linalg.norm(_metres(place - ground, ground)))
-    if off_m <= _FAR_M + extent_m:
+    if off_m <= _MAX_DISTANCE_M + extent_m:
         return
     figures = {"distance_m": off_m}
     sentence = (
@@ -50,7 +50,7 @@ def check_camera_position(
         f" {place_text(crs, *ground.tolist()).partition(';')[0]}"
     )
     swapped = float(np.linalg.norm(_metres(place - ground[::-1], place)))
-    if swapped <= _FAR_M + extent_m:
+    if swapped <= _MAX_DISTANCE_M + extent_m:
         yield grave(
             Cause.AXES_SWAPPED,
             f"{sentence}: with longitude and latitude exchanged it fits",
@@ -69,8 +69,7 @@ def check_camera_position(
 def check_altitude(altitude_m: FloatArray, height_above_m: FloatArray) -> Iterator[Doubt]:
     """Compare altitudes above take-off (n,) with measured heights above the plate (n,) [m].
 
-    Measured heights of half or double size come from diameters that are radii, or from a
-    calibration of another size.
+    A ratio of one half or two is a sign of diameters that are radii, or the reverse.
     """
     known = (altitude_m > _MIN_ALTITUDE_M) & (height_above_m > 0.0)
     if np.count_nonzero(known) < 3:
@@ -78,8 +77,8 @@ def check_altitude(altitude_m: FloatArray, height_above_m: FloatArray) -> Iterat
     ratio = float(np.median(height_above_m[known] / altitude_m[known]))
     figures = {"ratio": ratio}
     sentence = (
-        f"the camera is {ratio:.2g} times as high above the target as its altitude above take-off"
-        " says (median)"
+        f"the camera's measured height above the target is {ratio:.2g} times its altitude above"
+        " take-off (median)"
     )
     for factor, words, remedy in (
         (0.5, "diameters seem to be radii", "give diameters in [[target]], not radii"),

@@ -1,4 +1,4 @@
-"""Frames against trajectory and EXIF in time: the errors that clocks make."""
+"""Checks of frame times against trajectory and EXIF, and the usual errors of clocks."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ _WEEK_S = 604_800.0
 _ROLLOVER_S = 1024 * _WEEK_S
 _HOUR_S, _DAY_S = 3600.0, 86_400.0
 GPS_MINUS_UTC_S, TAI_MINUS_UTC_S = 18.0, 37.0
-_LEAP_TOLERANCE_S = 1.2  # EXIF has whole seconds
-_HOUR_TOLERANCE_S = 60.0
-_STEADY_S = 2.0
-_SAME_SHARE = 0.02  # of the interval between frames
-_MOST_OUTSIDE = 0.1  # of the frames: some are taken before a logger starts
-_MOSTLY = 0.5
-_FEWEST_WHOLE = 5  # times; fewer may be whole seconds by chance
+_LEAP_TOLERANCE_S = 1.2  # of differences in seconds, because EXIF has whole seconds
+_HOUR_TOLERANCE_S = 60.0  # of differences in hours and more
+_MAX_SPREAD_S = 2.0  # of a steady difference, by the median
+_SAME_TIME_SHARE = 0.02  # of the interval between frames, below which times count as equal
+_MAX_OUTSIDE_SHARE = 0.1  # of the frames: some are taken before a logger starts
+_GRAVE_OUTSIDE_SHARE = 0.5
+_MIN_WHOLE_SECONDS = 5  # fewer times may be whole seconds by chance
 _CHECK_DATES = (
     "check the date and GPS week of both files: [vehicle] date names the first day of a trajectory"
     " in seconds of the week"
 )
-"""Not time_offset_s, with which points would have the time of the wrong day."""
+"""The remedy is not time_offset_s: with it, points would have times on the wrong day."""
 
 
 def clock_shifts_s() -> Iterator[tuple[float, str]]:
-    """Yield what clocks differ by, the likelier first, as seconds and in words.
+    """Yield usual differences between clocks, the likelier first, in seconds and in words.
 
-    A shift is what is to be added to frame times.
+    The difference is to be added to frame times.
     """
     signs = (-1.0, 1.0)
     for sign in signs:
@@ -46,11 +46,14 @@ def clock_shifts_s() -> Iterator[tuple[float, str]]:
     for quarter, sign in product(quarters, signs):
         yield sign * quarter * 0.25 * _HOUR_S, "one of them seems to be local time"
     for sign in signs:
-        yield sign * _DAY_S, "they are of another day"
+        yield sign * _DAY_S, "they are of different days"
     for hours, leap_s, sign in product(range(1, 15), (GPS_MINUS_UTC_S, -GPS_MINUS_UTC_S), signs):
-        yield sign * (hours * _HOUR_S + leap_s), "one of them seems to be local time, and of GPS"
+        yield (
+            sign * (hours * _HOUR_S + leap_s),
+            "they seem to differ by a time zone and by GPS minus UTC",
+        )
     for sign in signs:
-        yield sign * _WEEK_S, "they are of another GPS week"
+        yield sign * _WEEK_S, "they are of different GPS weeks"
     for rollovers, sign in product((1, 2), signs):
         yield sign * rollovers * _ROLLOVER_S, "GPS weeks are counted modulo 1024 in one of them"
 
@@ -58,15 +61,17 @@ def clock_shifts_s() -> Iterator[tuple[float, str]]:
 def check_overlap(
     frame_s: FloatArray, trajectory_s: FloatArray, time_offset_s: float
 ) -> Iterator[Doubt]:
-    """Tell frames (n,) outside of a trajectory (m,) in time; try what would bring them inside.
+    """Yield the doubt about frames (n,) that lie outside a trajectory (m,) in time.
 
-    Both in Unix UTC [s]; `time_offset_s` is that of flight.toml.
+    Usual differences between clocks are tried for one that brings the frames inside. Both times are
+    Unix UTC [s]; `time_offset_s` is that of flight.toml.
     """
     first, last = float(trajectory_s[0]), float(trajectory_s[-1])
     times = frame_s + time_offset_s
     outside = float(np.mean((times < first) | (times > last))) if len(times) else 0.0
-    doubt = grave if outside > _MOSTLY else mild  # a logger may have been started late
-    if outside <= _MOST_OUTSIDE:
+    # few frames outside may have been taken before the logger was started
+    doubt = grave if outside > _GRAVE_OUTSIDE_SHARE else mild
+    if outside <= _MAX_OUTSIDE_SHARE:
         return
     count = round(outside * len(times))
     figures = {"frames_outside": float(count), "frames": float(len(times))}
@@ -88,7 +93,7 @@ def check_overlap(
             )
             yield doubt(
                 Cause.CLOCK,
-                f"{sentence}: {words}; {_seconds(abs(shift_s))} {which} all would lie inside",
+                f"{sentence}: {words}; {_seconds(abs(shift_s))} {which}, all would lie inside",
                 _CHECK_DATES if shift_s % _DAY_S == 0.0 else remedy,
                 {**figures, "shift_s": shift_s},
             )
@@ -103,7 +108,7 @@ def check_overlap(
             _CHECK_DATES,
             {**figures, "shift_s": days * _DAY_S},
         )
-    elif outside == 1.0:  # blocks partly inside are flown for longer than vehicles drive
+    elif outside == 1.0:  # if some are inside, the flight just lasted longer than the drive
         yield grave(
             Cause.NO_OVERLAP,
             sentence,
@@ -113,35 +118,36 @@ def check_overlap(
 
 
 def check_completeness(frames: Sequence[str], times_s: Mapping[str, float]) -> Iterator[Doubt]:
-    """Tell frames without a time: the vehicle's place in them is not known."""
+    """Yield the doubt about frames without a time, in which the vehicle's position is unknown."""
     untimed = [frame for frame in frames if frame not in times_s]
     if not untimed:
         return
     figures = {"frames_without_time": float(len(untimed)), "frames": float(len(frames))}
     have = "has" if len(untimed) == 1 else "have"
     sentence = f"{len(untimed)} of {len(frames)} frames {have} no time, such as {untimed[0]}"
-    remedy = "give [frames] times with one line per frame, named as below the frames folder"
+    remedy = "give [frames] times with one line per frame, named relative to the frames folder"
     doubt = grave if len(untimed) == len(frames) else mild
     yield doubt(Cause.NO_TIMES, sentence, remedy, figures)
 
 
 def check_fractions(frame_s: FloatArray) -> Iterator[Doubt]:
-    """Tell frame times (n,) that are all whole seconds: of clocks that have no others, or cut.
+    """Yield the doubt about frame times (n,) that are all whole seconds.
 
-    Spreadsheets cut numbers of ten digits where the column is narrow, and save them so.
+    Either the clock has no fractions, or they were lost: spreadsheets round numbers of ten digits
+    in narrow columns, and save them so.
     """
-    if len(frame_s) < _FEWEST_WHOLE or np.any(frame_s != np.rint(frame_s)):
+    if len(frame_s) < _MIN_WHOLE_SECONDS or np.any(frame_s != np.rint(frame_s)):
         return
     yield mild(
         Cause.WHOLE_SECONDS,
-        f"all {len(frame_s)} frame times are whole seconds, in which a vehicle moves metres",
-        "give times to the millisecond; if a spreadsheet has cut them, export the file again",
+        f"all {len(frame_s)} frame times are whole seconds; a vehicle moves metres in a second",
+        "give times to the millisecond; if a spreadsheet has rounded them, export the file again",
         {"frames": float(len(frame_s))},
     )
 
 
 def check_same_times(times_s: Mapping[str, float]) -> Iterator[Doubt]:
-    """Tell frames that have the time of another: one camera takes one photograph at a time."""
+    """Yield the doubt about frames with equal times: a camera takes one photograph at a time."""
     first_of: dict[float, str] = {}
     pairs = [
         (frame, first_of[times_s[frame]])
@@ -154,26 +160,26 @@ def check_same_times(times_s: Mapping[str, float]) -> Iterator[Doubt]:
     have = "has" if len(pairs) == 1 else "have"
     yield mild(
         Cause.SAME_TIMES,
-        f"{len(pairs)} of {len(times_s)} frames {have} the time of another frame, such as {frame}"
-        f" that of {first}",
-        "take copies of frames out of the folder, since each counts as an observation of its own;"
-        " if the times are in whole seconds, give better ones",
+        f"{len(pairs)} of {len(times_s)} frames {have} the time of another frame; {frame}, for"
+        f" example, has that of {first}",
+        "remove copies of frames from the folder, because each counts as an observation of its"
+        " own; if the times are in whole seconds, give more precise ones",
         {"frames": float(len(pairs))},
     )
 
 
 def check_exif_times(times_s: Sequence[float], exif_s: Sequence[float]) -> Iterator[Doubt]:
-    """Compare the times of frames with those that their EXIF has, both Unix UTC [s], in pairs.
+    """Compare the times of frames with those in their EXIF, both Unix UTC [s], in pairs.
 
-    A camera's clock is often set by hand and drifts. Only a steady difference of leap seconds,
-    hours or weeks tells something.
+    A camera's clock is often set by hand, and drifts. Only a steady difference of leap seconds,
+    hours or weeks points to an error.
     """
     if len(times_s) < 3:
         return
     difference = np.asarray(times_s) - np.asarray(exif_s)
     middle = float(np.median(difference))
     spread = float(np.median(np.abs(difference - middle)))
-    if spread > _STEADY_S:
+    if spread > _MAX_SPREAD_S:
         yield mild(
             Cause.FRAME_ORDER,
             f"the frames' times and those of their EXIF differ by {difference.min():.1f} …"
@@ -185,10 +191,10 @@ def check_exif_times(times_s: Sequence[float], exif_s: Sequence[float]) -> Itera
     interval = float(np.median(np.abs(np.diff(exif_s))))
     for step, word in ((1, "next"), (-1, "previous")):
         moved = np.roll(np.asarray(exif_s), -step)[1:-1] - np.asarray(times_s)[1:-1]
-        if abs(middle) > 0.5 * interval and np.median(np.abs(moved)) < _SAME_SHARE * interval:
+        if abs(middle) > 0.5 * interval and np.median(np.abs(moved)) < _SAME_TIME_SHARE * interval:
             yield mild(
                 Cause.FRAME_ORDER,
-                f"the frames' times are those that the EXIF of the {word} frame has",
+                f"the frames' times are those in the EXIF of the {word} frame",
                 "check that every line of the times file has the time of the frame it names",
                 {"difference_s": middle},
             )
@@ -213,7 +219,7 @@ def check_exif_times(times_s: Sequence[float], exif_s: Sequence[float]) -> Itera
 
 
 def _whole_days(times: FloatArray, first: float, last: float) -> int | None:
-    """Return the whole days (of any number) that bring all times inside, if any do."""
+    """Return the number of whole days that brings all times inside; None if none does."""
     days = round((0.5 * (first + last) - float(np.median(times))) / _DAY_S)
     if not days:
         return None
@@ -229,8 +235,8 @@ def time_span(times_s: FloatArray) -> str:
 
 
 def _seconds(seconds: float) -> str:
-    """Return a time span in the unit that suits it."""
-    for unit_s, unit in ((_DAY_S, "days"), (_HOUR_S, "h")):
+    """Return a time span in a suitable unit."""
+    for unit_s, unit in ((_DAY_S, "d"), (_HOUR_S, "h")):
         if seconds >= unit_s:
             return f"{seconds / unit_s:.6g} {unit}"
     return f"{seconds:.4g} s"

@@ -1,4 +1,4 @@
-"""A vehicle's attitude against its course over ground, and against the level of a road."""
+"""Checks of a vehicle's attitude against its course over ground, and against a level road."""
 
 from __future__ import annotations
 
@@ -12,43 +12,44 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.target_positions import Vehicle
 from kgcp.quality.checks.doubt import Cause, Doubt, grave
 
-_LARGEST_DEG = 20.0  # a car's crab angle and GNSS noise stay far below
-_FITTING_DEG = 8.0
-_STEEP_DEG = 35.0
-_BASE_S = 0.5  # over which a course is taken: one step of a fast logger is all noise
+_MAX_OFF_DEG = 20.0  # of headings from the course; crab angles and GNSS noise are far smaller
+_MAX_FITTING_DEG = 8.0  # the same of another reading of the headings that fits
+_MAX_TILT_DEG = 35.0
+# Half the base of a course: over one interval of a fast logger it would be mere noise.
+_HALF_BASE_S = 0.5
 _MIN_SPEED_M_S = 1.0
 _MIN_EPOCHS = 10
-_MIN_WAY_M = 10.0
-_MOST_EPOCHS = 20_000  # more tell nothing new
+_MIN_EXTENT_M = 10.0  # of the drive
+_MAX_EPOCHS = 20_000  # more would tell nothing new
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Course:
-    """A vehicle while it moves, at n epochs."""
+    """Course and attitude of a moving vehicle at n epochs."""
 
     course_deg: FloatArray  # (n,): direction of motion, clockwise from true north [deg]
-    attitude_deg: FloatArray  # (n, 3): roll, pitch, heading as the trajectory has them [deg]
+    attitude_deg: FloatArray  # (n, 3): roll, pitch, heading as in the trajectory [deg]
 
     @property
     def median_off_deg(self) -> float:
-        """How far headings are from the course [deg]."""
+        """Median difference of headings from the course [deg]."""
         return _median_off(self.attitude_deg[:, 2], self.course_deg)
 
 
 def course_of(vehicle: Vehicle, attitude_deg: FloatArray) -> Course | None:
-    """Return course and attitude while the vehicle moves; None where it hardly does.
+    """Return course and attitude while the vehicle moves; None if it hardly does.
 
-    `attitude_deg` (n, 3) is the trajectory's own: making rotations of angles in gon loses
-    whole turns.
+    `attitude_deg` (n, 3) are the trajectory's own angles. Those of rotations are wrapped at 360°,
+    which angles in gon would not survive.
     """
     motion = vehicle.motion
     span = np.linalg.norm(np.ptp(motion.position_m[:, :2], axis=0))
-    if span < _MIN_WAY_M:
+    if span < _MIN_EXTENT_M:
         return None
-    step = max(1, len(motion.time_s) // _MOST_EPOCHS)
+    step = max(1, len(motion.time_s) // _MAX_EPOCHS)
     since = motion.time_s - motion.time_s[0]
     middle = since[::step]
-    start, end = middle - _BASE_S, middle + _BASE_S
+    start, end = middle - _HALF_BASE_S, middle + _HALF_BASE_S
     chord = np.column_stack(
         [
             np.interp(end, since, axis) - np.interp(start, since, axis)
@@ -57,8 +58,8 @@ def course_of(vehicle: Vehicle, attitude_deg: FloatArray) -> Course | None:
     )
     level = vehicle.local_frame.level_rotations(motion.position_m[::step])
     east, north, _ = np.einsum("nji,nj->in", level, chord)
-    whole = np.minimum(end, since[-1]) - np.maximum(start, 0.0)
-    moves = np.hypot(east, north) > _MIN_SPEED_M_S * whole
+    base_s = np.minimum(end, since[-1]) - np.maximum(start, 0.0)
+    moves = np.hypot(east, north) > _MIN_SPEED_M_S * base_s
     if np.count_nonzero(moves) < _MIN_EPOCHS:
         return None
     return Course(np.degrees(np.arctan2(east, north))[moves], attitude_deg[::step][moves])
@@ -67,7 +68,7 @@ def course_of(vehicle: Vehicle, attitude_deg: FloatArray) -> Course | None:
 def check_attitude(course: Course | None) -> Iterator[Doubt]:
     """Compare headings with the course, and roll and pitch with a level road.
 
-    Where they do not fit, the usual other conventions are tried, and the one that fits is named.
+    If they do not fit, other usual conventions are tried, and those that fit are named.
     """
     if course is not None:
         yield from _check_heading(course)
@@ -79,7 +80,7 @@ Reading = tuple[str, str, Callable[[FloatArray], FloatArray]]
 READINGS: tuple[Reading, ...] = (
     ("180° from the course", "add 180° to every heading", lambda angle: angle + 180.0),
     (
-        "90° minus the course, as mathematicians count (anticlockwise from east)",
+        "90° minus the course, the mathematical convention (anticlockwise from east)",
         "give heading = 90° − angle, clockwise from north",
         lambda angle: 90.0 - angle,
     ),
@@ -95,7 +96,7 @@ READINGS: tuple[Reading, ...] = (
         lambda angle: 90.0 - np.degrees(angle),
     ),
     ("in gon", "give roll, pitch and heading in degrees", lambda angle: 0.9 * angle),
-    ("90° ahead of the course", "take 90° from every heading", lambda angle: angle - 90.0),
+    ("90° ahead of the course", "subtract 90° from every heading", lambda angle: angle - 90.0),
     ("90° behind the course", "add 90° to every heading", lambda angle: angle + 90.0),
     (
         "anticlockwise from south",
@@ -103,17 +104,17 @@ READINGS: tuple[Reading, ...] = (
         lambda angle: 180.0 - angle,
     ),
 )
-"""Other meanings of a heading, the likelier first, and what makes a heading of each."""
+"""Other conventions of headings, the likelier first: words, remedy and conversion to a heading."""
 
 _ANTICLOCKWISE_FROM_EAST = 1
 _RADIANS = 3, 4
 
 
 def _check_heading(course: Course) -> Iterator[Doubt]:
-    """Compare headings with the course; where they differ, name the readings that fit."""
+    """Compare headings with the course; if they differ, name the readings that fit."""
     heading = course.attitude_deg[:, 2]
     off = course.median_off_deg
-    if off <= _LARGEST_DEG:
+    if off <= _MAX_OFF_DEG:
         return
     figures = {"median_off_deg": off, "epochs": float(len(heading))}
     if not np.any(heading):
@@ -126,15 +127,15 @@ def _check_heading(course: Course) -> Iterator[Doubt]:
         )
         return
     sentence = f"headings are {off:.0f}° from the course over ground while driving (median)"
-    small = bool(np.all(np.abs(_wrapped(heading)) <= 2.0 * math.pi + 0.01))
+    may_be_radians = bool(np.all(np.abs(_wrapped(heading)) <= 2.0 * math.pi + 0.01))
     fits = []
     for index, (words, remedy, convert) in enumerate(READINGS):
-        if (index in _RADIANS) and not small:
+        if (index in _RADIANS) and not may_be_radians:
             continue
-        left = _median_off(convert(heading), course.course_deg)
-        if left < _FITTING_DEG:
-            fits.append((left, index, words, remedy))
-    if small:  # no other reading of angles that are all so small is as likely
+        converted_off = _median_off(convert(heading), course.course_deg)
+        if converted_off < _MAX_FITTING_DEG:
+            fits.append((converted_off, index, words, remedy))
+    if may_be_radians:  # if all angles are so small, other readings are less likely
         fits.sort(key=lambda fit: (fit[1] not in _RADIANS, fit[1]))
     else:
         enough = 2.0 * min((fit[0] for fit in fits), default=0.0) + 1.0
@@ -142,12 +143,12 @@ def _check_heading(course: Course) -> Iterator[Doubt]:
     if not fits:
         yield grave(
             Cause.HEADING,
-            f"{sentence}, and no other reading of the angles fits",
+            f"{sentence}, and no other convention fits",
             "check the columns roll_deg, pitch_deg, heading_deg and the order of x and y",
             figures,
         )
         return
-    left, index, words, remedy = fits[0]
+    converted_off, index, words, remedy = fits[0]
     code = Cause.ANGLE_UNIT if index in (*_RADIANS, 5) else Cause.HEADING
     others = "".join(f", or {fit[2]}" for fit in fits[1:3])
     if index == _ANTICLOCKWISE_FROM_EAST:
@@ -156,19 +157,20 @@ def _check_heading(course: Course) -> Iterator[Doubt]:
         code,
         f"{sentence}: they seem to be {words}{others}",
         remedy,
-        {**figures, "left_deg": left},
+        {**figures, "left_deg": converted_off},
     )
 
 
 def _check_level(course: Course) -> Iterator[Doubt]:
     roll, pitch = np.median(course.attitude_deg[:, :2], axis=0).tolist()
-    if max(abs(roll), abs(pitch)) < _STEEP_DEG:
+    if max(abs(roll), abs(pitch)) < _MAX_TILT_DEG:
         return
-    words = "roll is about 180°: its z axis points up" if abs(roll) > 145.0 else "it lies on a side"
+    words = "its z axis points up" if abs(roll) > 145.0 else "no vehicle is tilted so much"
     yield grave(
         Cause.ATTITUDE,
         f"the vehicle's roll is {roll:.0f}° and its pitch {pitch:.0f}° (medians): {words}",
-        "give the attitude of axes x forward, y right, z down, rolled from north, east, down",
+        "give roll, pitch and heading of axes x forward, y right, z down relative to north, east,"
+        " down",
         {"roll_deg": roll, "pitch_deg": pitch},
     )
 

@@ -1,4 +1,4 @@
-"""What does not fit in a flight, with its likely cause and what to do about it."""
+"""Doubts about a flight: what does not fit, the likely cause, and what to do about it."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from kgcp.errors import one_line
 
 
 class Severity(StrEnum):
-    """How sure a doubt is that the results are wrong."""
+    """How serious a doubt is."""
 
     GRAVE = "grave"
     DOUBT = "doubt"
 
     @property
     def words(self) -> str:
-        """As it is printed in front of a sentence."""
+        """The words before a sentence."""
         return "doubt" if self is Severity.DOUBT else "grave doubt"
 
 
 class Cause(StrEnum):
-    """What may be wrong with a flight: the `code` of a doubt, and a sentence for the documents."""
+    """What may be wrong with a flight: the `code` of a doubt, and its description in the docs."""
 
     description: str
 
     def __new__(cls, word: str, description: str) -> Self:
-        """Make a member whose value is the word alone."""
+        """Create a member whose value is the word only."""
         member = str.__new__(cls, word)
         member._value_ = word
         member.description = description
@@ -101,12 +101,12 @@ class Doubt:
     severity: Severity
     sentence: str  # what does not fit, with figures
     remedy: str  # what to do, beginning with a verb
-    # the numbers behind it, with their units in their names
+    # numbers from which it follows, with their units in their names
     figures: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def is_grave(self) -> bool:
-        """Whether the results are worthless if it is right."""
+        """Whether the results are worthless if the doubt is justified."""
         return self.severity is Severity.GRAVE
 
     def __str__(self) -> str:
@@ -116,7 +116,7 @@ class Doubt:
 def grave(
     code: Cause, sentence: str, remedy: str, figures: Mapping[str, float] | None = None
 ) -> Doubt:
-    """Return a doubt that makes the results worthless if it is right."""
+    """Return a doubt that, if justified, makes the results worthless."""
     return Doubt(code, Severity.GRAVE, sentence, remedy, figures or {})
 
 
@@ -128,6 +128,6 @@ def mild(
 
 
 def ranked(doubts: Iterable[Doubt]) -> tuple[Doubt, ...]:
-    """Return doubts with the grave ones first, else in their order, and each only once."""
+    """Return doubts without duplicates, grave ones first, otherwise in their order."""
     once = {(doubt.code, doubt.sentence, doubt.remedy): doubt for doubt in doubts}
     return tuple(sorted(once.values(), key=lambda doubt: not doubt.is_grave))

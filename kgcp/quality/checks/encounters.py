@@ -1,4 +1,7 @@
-"""Frames in which a target's place is known twice: by its vehicle, and by camera and reference."""
+"""Frames in which a target's position is known twice: by its vehicle, and by camera and reference.
+
+They differ from the frames of `consistency` in that any input can be replaced, to try slips.
+"""
 
 from __future__ import annotations
 
@@ -22,17 +25,17 @@ from kgcp.georef.trajectory import (
 )
 
 MIN_ENCOUNTERS = 5
-_MOST_ENCOUNTERS = 80  # more tell nothing new about slips, which are the same in all frames
-_RUN = 10  # consecutive frames, since times may be those of the next frame
-_FLOOR_M = 0.01  # of what states no standard deviation, and of models
+_MAX_ENCOUNTERS = 80  # more tell nothing new about slips, which are the same in all frames
+_RUN = 10  # consecutive frames, because times may be those of the next frame
+_MIN_SD_M = 0.01  # of a coordinate: models, and inputs without standard deviations
 _MEDIAN_CHI2 = 2.366  # of three coordinates
-_WIDEST_GAP = 4.0  # of the usual intervals of a trajectory
-_HELD_SHARE = 0.6  # of the encounters that a trial must have inside the trajectory
+_MAX_GAP_INTERVALS = 4.0  # longest interval that is interpolated, in medians of the interval
+_MIN_COVERED_SHARE = 0.6  # of the encounters that must be inside the trajectory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Encounters:
-    """What is known in n frames of a moving target, as if some inputs were other ones."""
+    """Data of n frames with a moving target; inputs can be replaced, to undo slips."""
 
     vehicle: Vehicle
     camera: Camera
@@ -46,11 +49,11 @@ class Encounters:
     centre_m: FloatArray  # (n, 3): reference projection centres in the ENU frame [m]
     enu_from_camera: FloatArray  # (n, 3, 3)
     opk_deg: FloatArray  # (n, 3): reference attitude as the file has it
-    # (n,): of either coordinate of the difference of both places, by all stated standard
-    # deviations, at least 1 cm² [m²]
+    # (n,): variance of each coordinate of the difference of both positions, by all stated standard
+    # deviations, at least (1 cm)² [m²]
     variance_m2: FloatArray
-    # (n, 3, 3): north, east, down where the vehicle was, in the ENU frame, as columns; the same for
-    # all times that are tried
+    # (n, 3, 3): north, east, down at the vehicle in the ENU frame, as columns; kept for all times
+    # that are tried
     frame_from_ned: FloatArray
 
     @classmethod
@@ -61,7 +64,7 @@ class Encounters:
         poses: ReferencePoses,
         camera: Camera,
     ) -> Encounters | None:
-        """Collect the frames, thinned if there are many; None where too few tell."""
+        """Collect the frames, a selection if there are many; None if there are too few."""
         vehicle = target_positions.vehicle
         rows = {frame: row for row, frame in enumerate(poses.frames)}
         posed = [
@@ -103,7 +106,7 @@ class Encounters:
         return replace(draft, frame_from_ned=level @ ENU_FROM_NED).at(time_s)
 
     def at(self, time_s: FloatArray) -> Encounters:
-        """Return the encounters with the vehicle as it was at other times (n,) [s]."""
+        """Return the encounters with the vehicle's states at other times (n,) [s]."""
         position, body = _states(self.vehicle.motion, time_s)
         attitude = roll_pitch_heading_deg(np.swapaxes(self.frame_from_ned, 1, 2) @ body)
         return replace(self, time_s=time_s, position_m=position, attitude_deg=attitude)
@@ -111,7 +114,7 @@ class Encounters:
     def is_covered(self, time_s: FloatArray) -> bool:
         """Tell whether enough of other times (n,) lie between the trajectory's ends."""
         first, last = self.vehicle.motion.time_s[[0, -1]]
-        return bool(np.mean((time_s >= first) & (time_s <= last)) >= _HELD_SHARE)
+        return bool(np.mean((time_s >= first) & (time_s <= last)) >= _MIN_COVERED_SHARE)
 
     @property
     def frame_from_body(self) -> FloatArray:
@@ -119,8 +122,8 @@ class Encounters:
         axes: FloatArray = self.frame_from_ned @ body_to_ned(*self.attitude_deg.T)
         return axes
 
-    def seen_by(self, other: Encounters) -> Encounters:
-        """Return the vehicle of these with camera and reference of other encounters."""
+    def with_camera_of(self, other: Encounters) -> Encounters:
+        """Return these encounters with camera and reference of others."""
         return replace(
             self,
             camera=other.camera,
@@ -131,23 +134,23 @@ class Encounters:
 
     @property
     def by_vehicle_m(self) -> FloatArray:
-        """Place of the target by the vehicle (n, 3), in the ENU frame [m]."""
+        """Position of the target by the vehicle (n, 3), in the ENU frame [m]."""
         return np.asarray(self.position_m + self.frame_from_body @ self.lever_arm_m)
 
     @property
     def by_camera_m(self) -> FloatArray:
-        """Place of the target by camera and reference (n, 3), in the ENU frame [m]."""
+        """Position of the target by camera and reference (n, 3), in the ENU frame [m]."""
         sight = np.einsum("nij,nj->ni", self.enu_from_camera, self.in_camera_m)
         return np.asarray(self.centre_m + sight)
 
     @property
     def offset_m(self) -> FloatArray:
-        """Place by the vehicle minus place by the camera (n, 3), in the ENU frame [m]."""
+        """Position by the vehicle minus position by the camera (n, 3), in the ENU frame [m]."""
         return np.asarray(self.by_vehicle_m - self.by_camera_m)
 
     @property
     def misfit(self) -> float:
-        """Median square of the offsets over their variance: 1 where these are right."""
+        """Median of the offsets' χ², normalised to 1 if their variances are right."""
         return misfit_of(self.offset_m, self.variance_m2)
 
     @property
@@ -158,18 +161,18 @@ class Encounters:
 
 
 def _thinned(count: int) -> list[int]:
-    """Return which of many encounters to take: runs of neighbours, evenly spaced."""
-    if count <= _MOST_ENCOUNTERS:
+    """Return which of many encounters to use: runs of neighbours, evenly spaced."""
+    if count <= _MAX_ENCOUNTERS:
         return [*range(count)]
-    starts = np.linspace(0, count - _RUN, _MOST_ENCOUNTERS // _RUN).astype(int)
+    starts = np.linspace(0, count - _RUN, _MAX_ENCOUNTERS // _RUN).astype(int)
     return (starts[:, None] + np.arange(_RUN)).ravel().tolist()
 
 
 def misfit_of(offset_m: FloatArray, variance_m2: FloatArray) -> float:
-    """Return the misfit of offsets (n, 3); infinite where too few are known."""
+    """Return the misfit of offsets (n, 3); infinite if too few are known."""
     square = np.sum(offset_m**2, axis=1) / variance_m2
     known = np.isfinite(square)
-    if np.count_nonzero(known) < max(MIN_ENCOUNTERS, _HELD_SHARE * len(square)):
+    if np.count_nonzero(known) < max(MIN_ENCOUNTERS, _MIN_COVERED_SHARE * len(square)):
         return np.inf
     return float(np.median(square[known])) / _MEDIAN_CHI2
 
@@ -181,10 +184,10 @@ def _variance_m2(
     row: list[int],
     time_s: FloatArray,
 ) -> FloatArray:
-    """Return variances (n,) [m²]: all errors as if they pointed in any direction."""
+    """Return variances (n,) [m²], as if each error were the same in all directions."""
     settings, motion = vehicle.settings, vehicle.motion
     distance = np.array([sighting.distance_m for sighting in sightings])
-    total = np.full(len(sightings), _FLOOR_M**2)
+    total = np.full(len(sightings), _MIN_SD_M**2)
     for sds in (
         [sighting.sd_distance_m or 0.0 for sighting in sightings],
         [sighting.sd_common_distance_m or 0.0 for sighting in sightings],
@@ -206,10 +209,10 @@ def _variance_m2(
 def _states(motion: Motion, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return positions (n, 3) and body axes (n, 3, 3) at times (n,); NaN where not covered.
 
-    A cubic through the four nearest samples: slips are tried at many times, for which splines
-    through a whole trajectory would take seconds each.
+    Positions follow a cubic through the four nearest samples. Slips are tried at many times, and
+    splines through a whole trajectory would take seconds for each.
     """
-    time_s = np.nan_to_num(time_s, nan=motion.time_s[0] - 1.0)  # not known is not covered
+    time_s = np.nan_to_num(time_s, nan=motion.time_s[0] - 1.0)  # unknown times are not covered
     left = np.clip(np.searchsorted(motion.time_s, time_s, side="right") - 1, 0, None)
     left = np.clip(left, 0, len(motion.time_s) - 2)
     position = _cubic(motion, left, time_s)
@@ -220,7 +223,7 @@ def _states(motion: Motion, time_s: FloatArray) -> tuple[FloatArray, FloatArray]
     turn = (end * start.inv()).as_rotvec()
     body = (Rotation.from_rotvec(share[:, None] * turn) * start).as_matrix()
     outside = (time_s < motion.time_s[0]) | (time_s > motion.time_s[-1])
-    outside |= step > _WIDEST_GAP * _usual_step(motion)
+    outside |= step > _MAX_GAP_INTERVALS * _usual_step(motion)
     position[outside] = np.nan
     return position, body
 
@@ -231,7 +234,7 @@ def _usual_step(motion: Motion) -> float:
 
 
 def _cubic(motion: Motion, left: IndexArray, time_s: FloatArray) -> FloatArray:
-    """Return Lagrange's polynomials (n, 3) through four samples about each time (n,)."""
+    """Return Lagrange interpolations (n, 3) through the four samples around each time (n,)."""
     count = min(4, len(motion.time_s))
     first = np.clip(left - 1, 0, len(motion.time_s) - count)
     nodes = first[:, None] + np.arange(count)

@@ -1,4 +1,4 @@
-"""Frames against the camera, by what their headers say: size, maker, focal length."""
+"""Checks of the frames' headers against the camera: size, maker, focal length."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ import numpy as np
 from kgcp.geometry.camera import Camera
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
 
-_SMALL_FRAME_MM = 36.0, math.hypot(36.0, 24.0)  # width and diagonal that equivalents refer to
-# equivalents are rounded, refer to width or diagonal, and may be those of cropped video
+_SMALL_FORMAT_MM = 36.0, math.hypot(36.0, 24.0)  # width and diagonal; equivalents refer to either
+# Factor by which fx may differ from the 35 mm equivalent. Equivalents are rounded, refer to the
+# width or the diagonal, and may be those of cropped video.
 _FOCAL_TOLERANCE = 1.25
-_SIZE_TOLERANCE = 1.1
-_FOCUSED = 1.03  # what focusing makes of a focal length in EXIF
+_SIZE_TOLERANCE = 1.1  # the same about half and double size
+_FOCUS_FACTOR = 1.03  # by which focusing changes a focal length in EXIF
 
 
 @dataclass(frozen=True, slots=True)
 class FrameHeader:
-    """What the header of one frame says; None where it says nothing."""
+    """Data from the header of one frame; None: not in the header."""
 
     frame: str  # path relative to the frames folder
     size_px: tuple[int, int] | None = None  # width and height
     camera: str = ""  # maker, model and serial number; empty: not known
-    # focal length, and the one of a small-format camera with the same angle of view
     focal_mm: float | None = None
-    focal_35_mm: float | None = None
-    focal_px: float | None = None  # the first by the resolution of the focal plane
-    time_s: float | None = None  # Unix UTC, as far as the header names its time zone [s]
+    focal_35_mm: float | None = None  # of a small-format camera with the same angle of view
+    focal_px: float | None = None  # from `focal_mm` and the resolution of the focal plane
+    time_s: float | None = None  # Unix UTC, if the header states its time zone [s]
     # of the camera, WGS 84
     longitude_deg: float | None = None
     latitude_deg: float | None = None
@@ -54,22 +54,22 @@ def _check_sizes(headers: Sequence[FrameHeader], camera: Camera) -> Iterator[Dou
     )
     name = next(header.frame for header in headers if header.size_px == (width, height))
     sentence = (
-        f"{wrong} of {sizes.total()} frames are not {camera.width} x {camera.height} px as the"
-        f" camera: {name} is {width} x {height} px"
+        f"{wrong} of {sizes.total()} frames are not {camera.width} x {camera.height} px, the"
+        f" camera's size: {name} is {width} x {height} px"
     )
     figures = {"frames": float(wrong), "width_px": float(width), "height_px": float(height)}
     if (width, height) == (camera.height, camera.width):
         remedy = (
-            "exchange width and height in [camera] if the calibration is of upright frames;"
-            " do not turn frames: kgcp reads them as the sensor did"
+            "exchange width and height in [camera] if the calibration is that of upright frames;"
+            " do not rotate frames, because kgcp reads them as the sensor did"
         )
     elif abs(width / camera.width - height / camera.height) < 0.01 * width / camera.width:
         remedy = (
-            f"give the calibration of frames of this size: this one is {camera.width / width:.4g}"
-            " times as large"
+            "give the calibration of frames of this size; that in flight.toml is of frames"
+            f" {camera.width / width:.4g} times as large"
         )
     else:
-        remedy = "give the calibration of these frames, or take frames of other cameras out"
+        remedy = "give the calibration of these frames, or remove frames of other cameras"
     doubt = grave if 10 * wrong > sizes.total() else mild
     yield doubt(Cause.FRAME_SIZE, sentence, remedy, figures)
 
@@ -91,19 +91,19 @@ def _check_cameras(headers: Sequence[FrameHeader]) -> Iterator[Doubt]:
     )
     yield grave(
         Cause.TWO_CAMERAS,
-        f"the frames are of {len(cameras)} cameras or focal lengths: most of {_named(first)},"
-        f" but {count} of {_named(second)}, such as {name}",
+        f"the frames are from {len(cameras)} cameras or focal lengths: most from {_named(first)},"
+        f" but {count} from {_named(second)}, such as {name}",
         "make a flight folder of its own for each camera and zoom",
         {"cameras": float(len(cameras)), "frames": float(count)},
     )
 
 
 def _zooms_mm(headers: Sequence[FrameHeader]) -> dict[float, float]:
-    """Return, for each focal length, the smallest of those that are the same but for focusing."""
+    """Return, for each focal length, the smallest from which it differs by focusing only."""
     zooms: dict[float, float] = {}
     first = 0.0
     for focal_mm in sorted({header.focal_mm for header in headers if header.focal_mm is not None}):
-        if focal_mm > _FOCUSED * first:
+        if focal_mm > _FOCUS_FACTOR * first:
             first = focal_mm
         zooms[focal_mm] = first
     return zooms
@@ -121,23 +121,23 @@ def _check_focal_length(headers: Sequence[FrameHeader], camera: Camera) -> Itera
     focal_35_mm = float(np.median(known))
     sizes = max(camera.width, camera.height), math.hypot(camera.width, camera.height)
     expected = [
-        focal_35_mm / film * pixels for film, pixels in zip(_SMALL_FRAME_MM, sizes, strict=True)
+        focal_35_mm / film * pixels for film, pixels in zip(_SMALL_FORMAT_MM, sizes, strict=True)
     ]
     ratio = camera.mean_focal_px / math.sqrt(expected[0] * expected[1])
     if 1.0 / _FOCAL_TOLERANCE < ratio < _FOCAL_TOLERANCE:
         return
     figures = {"exif_focal_35_mm": focal_35_mm, "expected_fx_px": expected[0], "ratio": ratio}
     sentence = (
-        f"the frames' EXIF has a focal length of {focal_35_mm:g} mm (35 mm equivalent), that is fx"
-        f" = {expected[0]:.0f} px, but the camera has {camera.fx:.6g}"
+        f"the frames' EXIF states a focal length of {focal_35_mm:g} mm (35 mm equivalent), which is"
+        f" fx = {expected[0]:.0f} px, but the camera's fx is {camera.fx:.6g} px"
     )
     for factor, word in ((2.0, "double"), (0.5, "half")):
         if 1.0 / _SIZE_TOLERANCE < ratio / factor < _SIZE_TOLERANCE:
             yield grave(
                 Cause.CALIBRATION_SIZE,
                 f"{sentence}, {factor:g} times as much",
-                f"give the calibration of frames of {camera.width} x {camera.height} px: this"
-                f" one seems to be of {word} size",
+                f"give the calibration of frames of {camera.width} x {camera.height} px: that in"
+                f" flight.toml seems to be of frames of {word} size",
                 figures,
             )
             return

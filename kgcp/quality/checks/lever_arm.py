@@ -1,4 +1,4 @@
-"""Whether a lever arm can lead from a vehicle's trajectory point to a plate on its roof."""
+"""Check of the lever arm from a vehicle's trajectory point to a plate on its roof."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from collections.abc import Iterator, Sequence
 from kgcp.quality.checks.doubt import Cause, Doubt, mild
 from kgcp.settings import VehicleSettings
 
-_DEEPEST_M = 1.0  # below the trajectory point: an antenna on a mast beside the plate
-_LONGEST_M = 10.0
+_MAX_DOWN_M = 1.0  # of a plate below the trajectory point, an antenna on a mast
+_MAX_LENGTH_M = 10.0
 
 
 def check_lever_arm(settings: VehicleSettings, on_vehicle: Sequence[str]) -> Iterator[Doubt]:
-    """Tell a target below the vehicle, or beyond its length, and several at one place.
+    """Yield doubts about targets far below the trajectory point, beyond the vehicle, or together.
 
     Parameters
     ----------
@@ -31,25 +31,25 @@ def check_lever_arm(settings: VehicleSettings, on_vehicle: Sequence[str]) -> Ite
         )
     forward, right, down = settings.lever_arm_m
     figures = {"forward_m": forward, "right_m": right, "down_m": down}
-    if math.hypot(forward, right, down) > _LONGEST_M:
+    if math.hypot(forward, right, down) > _MAX_LENGTH_M:
         yield mild(
             Cause.LEVER_ARM,
             f"the lever arm is {math.hypot(forward, right, down):.1f} m long",
             "give it in metres, as forward, right, down",
             figures,
         )
-    elif down > _DEEPEST_M:
+    elif down > _MAX_DOWN_M:
         yield mild(
             Cause.LEVER_ARM,
             f"the lever arm puts the target {down:.2f} m below the trajectory point",
-            f"if the plate lies higher, give lever_arm_m[2] = {-down:g}: its third number"
-            " counts down",
+            f"if the plate is above it, give lever_arm_m[2] = {-down:g}: the third number is"
+            " positive downwards",
             figures,
         )
 
 
 def lever_arm_text(settings: VehicleSettings) -> str:
-    """Return where the target is, seen from the trajectory point, in words."""
+    """Return the direction from the trajectory point to the target, in words."""
     forward, right, down = settings.lever_arm_m
     parts = (
         (forward, "in front", "behind"),

@@ -31,23 +31,23 @@ def measured_doubts(
     headers: Sequence[FrameHeader],
     consistency: Consistency | None,
 ) -> tuple[Doubt, ...]:
-    """Return all doubts, grave ones first: those before measuring, and what measurements tell.
+    """Return all doubts, grave ones first: those from before measuring and those from measurements.
 
     Parameters
     ----------
     plausibility : sequence of Doubt
-        What did not fit before anything was measured.
+        Doubts from before anything was measured.
     headers : sequence of FrameHeader
-        Of some frames.
+        Headers of some frames.
     consistency : Consistency or None
-        Of the same sightings and poses.
+        From the same sightings and poses.
     """
     doubts = [
         *plausibility,
         *_of_altitude(sightings, headers),
         *check_static_targets(sightings, target_positions.static, camera),
     ]
-    # Where an input cannot be right, all that follows from it disagrees.
+    # If an input is certainly wrong, everything that follows from it disagrees.
     if poses is not None and not any(doubt.is_grave for doubt in plausibility):
         encounters = Encounters.of(sightings, target_positions, poses, camera)
         if encounters is not None:

@@ -1,4 +1,4 @@
-"""The direction in which the plate is mounted: by image and reference against the vehicle."""
+"""Check of the direction in which the plate is mounted, from images and reference poses."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from kgcp.quality.checks.doubt import Cause, Doubt, mild
 from kgcp.quality.checks.encounters import Encounters
 from kgcp.quality.number_text import minus
 
-_LARGEST_DEG = 8.0
-_STEADY_DEG = 8.0
-_RIGHT_ANGLE_DEG = 5.0  # closer to a multiple of 90°, that is what is meant
+_MAX_OFF_DEG = 8.0  # from mount_deg
+_MAX_SPREAD_DEG = 8.0  # of a steady rotation, by the median
+_RIGHT_ANGLE_DEG = 5.0  # within this of a multiple of 90°, that multiple is proposed
 
 
 def check_mount(encounters: Encounters) -> Iterator[Doubt]:
@@ -28,17 +28,18 @@ def check_mount(encounters: Encounters) -> Iterator[Doubt]:
     turns = np.exp(1j * np.radians(off))
     middle = math.degrees(float(np.angle(turns.mean())))
     spread = float(np.median(np.abs((off - middle + 180.0) % 360.0 - 180.0)))
-    if abs(middle) < _LARGEST_DEG or spread > _STEADY_DEG:
+    if abs(middle) < _MAX_OFF_DEG or spread > _MAX_SPREAD_DEG:
         return
-    seen = (mount_deg + middle + 180.0) % 360.0 - 180.0
-    nearest = 90.0 * round(seen / 90.0)
-    told = nearest if abs(seen - nearest) < _RIGHT_ANGLE_DEG else round(seen, 1)
+    measured_deg = (mount_deg + middle + 180.0) % 360.0 - 180.0
+    nearest = 90.0 * round(measured_deg / 90.0)
+    proposed = nearest if abs(measured_deg - nearest) < _RIGHT_ANGLE_DEG else round(measured_deg, 1)
     yield mild(
         Cause.MOUNT,
-        f"by images and reference poses the plate is turned by {minus(f'{seen:.1f}')}° ±"
-        f" {spread:.1f}° on the vehicle, but mount_deg is {mount_deg:g}",
-        f"set [vehicle] mount_deg = {told:g}, unless headings are wrong",
-        {"mount_deg": seen, "spread_deg": spread},
+        "according to images and reference poses, the plate is rotated by"
+        f" {minus(f'{measured_deg:.1f}')}° ± {spread:.1f}° on the vehicle, but mount_deg is"
+        f" {mount_deg:g}",
+        f"set [vehicle] mount_deg = {proposed:g}, unless headings are wrong",
+        {"mount_deg": measured_deg, "spread_deg": spread},
     )
 
 

@@ -1,4 +1,4 @@
-"""The pattern of a disagreement that no slip explains: what it grows with, and what that means."""
+"""Patterns in a disagreement that no slip explains, with their usual causes."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.quality.checks.doubt import Cause, Doubt, mild
 from kgcp.quality.checks.encounters import Encounters
 
-_SHOWN_SHARE = 0.2  # of the squared offsets that a pattern must explain to be named
-_PER_NUMBER = 0.02  # of the share that another number must explain to be preferred
-_FAR = 25.0  # squared offset over its median, beyond which a frame stands alone
-_LONE_M = 0.3
+_MIN_SHARE = 0.2  # of the squared offsets that a pattern must explain to be named
+_PENALTY = 0.02  # on the share, per fitted parameter, when patterns are ranked
+_OUTLYING_RATIO = 25.0  # of a squared offset to its median, and to its variance
+_MIN_OUTLYING_M = 0.3
 
 
 @dataclass(frozen=True, slots=True)
 class Pattern:
     """A part of the disagreement."""
 
-    share: float  # of the squared offsets that it explains
-    numbers: int  # how many are fitted
-    words: str  # what it looks like, with its amount
-    causes: str  # what makes such a pattern
+    share: float  # of the squared offsets, explained by it
+    parameters: int  # number of fitted parameters
+    words: str  # description, with its amount
+    causes: str  # usual causes of such a pattern
 
 
 def patterns(encounters: Encounters) -> tuple[Pattern, ...]:
-    """Return the patterns that explain most, best first.
+    """Return the patterns that explain a good part of the offsets, best first.
 
-    Each is fitted alone, by least squares of the offsets that are known.
+    Each is fitted alone to the known offsets, by least squares.
     """
     offset = encounters.offset_m
     known = np.isfinite(offset).all(axis=1)
@@ -48,7 +48,7 @@ def patterns(encounters: Encounters) -> tuple[Pattern, ...]:
     in_image *= encounters.in_camera_m[known][:, 2:3]
     outward = np.einsum("nij,nj->ni", encounters.enu_from_camera[known], in_image)
     up = np.broadcast_to(np.eye(3)[2], offset.shape)[:, :, None]
-    every = np.broadcast_to(np.eye(3), (len(offset), 3, 3))
+    constant = np.broadcast_to(np.eye(3), (len(offset), 3, 3))
     trials = (
         ("up and down only, by {0:.2f} m", up, "heights of another kind, or lever_arm_m[2]"),
         (
@@ -58,16 +58,16 @@ def patterns(encounters: Encounters) -> tuple[Pattern, ...]:
         ),
         ("along the track, by {0:.3f} s", track[:, :, None], "clocks, or lever_arm_m[0]"),
         ("constant in the vehicle's axes, by {norm:.2f} m", body, "lever_arm_m"),
-        ("constant on the ground, by {norm:.2f} m", every, "datum, or the base station"),
+        ("constant on the ground, by {norm:.2f} m", constant, "datum, or the base station"),
         (
             "growing towards the corners of the frame",
             outward[:, :, None],
             "k1, k2 …, or cx and cy",
         ),
     )
-    named = [_fitted(offset, design, words, causes) for words, design, causes in trials]
-    likely = [pattern for pattern in named if pattern.share > _SHOWN_SHARE]
-    return tuple(sorted(likely, key=lambda pattern: _PER_NUMBER * pattern.numbers - pattern.share))
+    fitted = [_fitted(offset, design, words, causes) for words, design, causes in trials]
+    likely = [pattern for pattern in fitted if pattern.share > _MIN_SHARE]
+    return tuple(sorted(likely, key=lambda pattern: _PENALTY * pattern.parameters - pattern.share))
 
 
 def unexplained(encounters: Encounters) -> Doubt:
@@ -78,22 +78,22 @@ def unexplained(encounters: Encounters) -> Doubt:
     return mild(
         Cause.UNEXPLAINED,
         f"vehicle and camera put the target {encounters.apart_m:.2f} m apart (median),"
-        f" {np.sqrt(encounters.misfit):.1f} times as much as their standard deviations say, which"
-        f" no single cause explains{pattern}",
-        "look at consistency.parquet for when; check times, trajectory, reference poses and their"
-        " standard deviations",
+        f" {np.sqrt(encounters.misfit):.1f} times as much as their standard deviations predict;"
+        f" no single cause explains this{pattern}",
+        "see in consistency.parquet when it occurs; check times, trajectory, reference poses and"
+        " their standard deviations",
         {"apart_m": encounters.apart_m, "misfit": encounters.misfit},
     )
 
 
 def check_lone_frames(encounters: Encounters) -> Iterator[Doubt]:
-    """Tell single frames that disagree where the others agree."""
+    """Yield the doubt about single frames that disagree while the others agree."""
     square = np.sum(encounters.offset_m**2, axis=1)
     known = np.isfinite(square)
     if not known.any():
         return
-    limit = max(_LONE_M**2, _FAR * float(np.median(square[known])))
-    far = known & (square > limit) & (square > _FAR * encounters.variance_m2)
+    limit = max(_MIN_OUTLYING_M**2, _OUTLYING_RATIO * float(np.median(square[known])))
+    far = known & (square > limit) & (square > _OUTLYING_RATIO * encounters.variance_m2)
     count, total = int(np.count_nonzero(far)), int(np.count_nonzero(known))
     if not count or 2 * count >= total:
         return
@@ -111,9 +111,11 @@ def check_lone_frames(encounters: Encounters) -> Iterator[Doubt]:
 def _fitted(offset: FloatArray, design: FloatArray, words: str, causes: str) -> Pattern:
     columns = design.reshape(-1, design.shape[2])
     values, *_ = np.linalg.lstsq(columns, offset.ravel(), rcond=None)
-    left = np.sum((offset.ravel() - columns @ values) ** 2) / max(np.sum(offset**2), 1e-12)
+    unexplained_share = np.sum((offset.ravel() - columns @ values) ** 2) / max(
+        np.sum(offset**2), 1e-12
+    )
     amount = words.format(abs(float(values[0])), norm=float(np.linalg.norm(values)))
-    return Pattern(1.0 - float(left), columns.shape[1], amount, causes)
+    return Pattern(1.0 - float(unexplained_share), columns.shape[1], amount, causes)
 
 
 def _velocity(encounters: Encounters) -> FloatArray:

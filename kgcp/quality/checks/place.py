@@ -1,4 +1,4 @@
-"""Whether coordinates lie where their CRS is meant to be used; if not, what they seem to be."""
+"""Check of coordinates against their CRS's area of use, and what they seem to be if outside."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.crs import AreaOfUse, area_of_use, is_geographic, longitude_latitude
 from kgcp.quality.checks.doubt import Cause, Doubt, grave
 
-_FAR_DEG = 3.5  # national zones serve their neighbours: EPSG:25832 all of Bavaria and Denmark
-_NEAR_DEG = 1.0
-_DEGREES = np.array([180.0, 90.0])
-_CIRCLE = np.array([np.pi, 0.5 * np.pi])
-_LONG_NAME = 75
-_ZONE = 1e6  # zone numbers stand before eastings of six digits: 32 689586
+# Largest distance from the area. Zones are also used beside it: EPSG:25832 in all of Bavaria and
+# Denmark.
+_MAX_OUTSIDE_DEG = 3.5
+_NEAR_DEG = 1.0  # largest distance from the area of another reading that fits
+_MAX_DEG = np.array([180.0, 90.0])  # longitude, latitude
+_MAX_RAD = np.array([np.pi, 0.5 * np.pi])
+_MAX_NAME_LENGTH = 75
+_ZONE_FACTOR = 1e6  # zone numbers may stand before eastings of six digits: 32 689586
 
 
 def check_place(crs: str, position_map: FloatArray, where: str) -> Iterator[Doubt]:
@@ -24,14 +26,14 @@ def check_place(crs: str, position_map: FloatArray, where: str) -> Iterator[Doub
     Parameters
     ----------
     where : str
-        What the positions are of, for sentences: "the trajectory".
+        Subject of the sentence: "the trajectory".
     """
     area = area_of_use(crs)
     xy = np.median(position_map[:, :2], axis=0)
     is_angular = is_geographic(crs)
     outside = _outside(area, crs, xy)
-    looks_radian = is_angular and bool(np.all(np.abs(xy) <= _CIRCLE))
-    if outside <= _FAR_DEG and not looks_radian:
+    may_be_radians = is_angular and bool(np.all(np.abs(xy) <= _MAX_RAD))
+    if outside <= _MAX_OUTSIDE_DEG and not may_be_radians:
         return
     x, y = xy.tolist()
     longitude, latitude = longitude_latitude(crs, xy[None])[0].tolist()
@@ -68,17 +70,17 @@ def _spot(longitude_deg: float, latitude_deg: float) -> str:
 
 
 def _short(name: str) -> str:
-    """Return the name of a region, cut behind one of its parts if it is long."""
-    if len(name) <= _LONG_NAME:
+    """Return the name of a region; a long one is cut after one of its parts."""
+    if len(name) <= _MAX_NAME_LENGTH:
         return name
-    end = max(name.rfind(mark, 0, _LONG_NAME) for mark in ";,:")
-    return f"{name[: end if end > 0 else _LONG_NAME]} …"
+    end = max(name.rfind(mark, 0, _MAX_NAME_LENGTH) for mark in ";,:")
+    return f"{name[: end if end > 0 else _MAX_NAME_LENGTH]} …"
 
 
 def _outside(area: AreaOfUse | None, crs: str, xy: FloatArray) -> float:
-    """Return how far a map point is outside the area [deg]; 0 where there is no area."""
+    """Return how far a map point is outside the area [deg]; 0 if the area is unknown."""
     place = longitude_latitude(crs, xy[None])[0]
-    if not np.isfinite(place).all() or np.any(np.abs(place) > 2.0 * _DEGREES):
+    if not np.isfinite(place).all() or np.any(np.abs(place) > 2.0 * _MAX_DEG):
         return 180.0
     if abs(float(place[1])) > 90.0:
         return 180.0
@@ -89,21 +91,21 @@ Guess = tuple[Cause, str, str]
 
 
 def _angular_guess(area: AreaOfUse | None, crs: str, xy: FloatArray) -> Guess | None:
-    """Name what longitude and latitude seem to be."""
+    """Return what the alleged longitude and latitude seem to be."""
     degrees = np.degrees(xy)
-    if np.all(np.abs(xy) <= _CIRCLE) and _outside(area, crs, degrees) < _NEAR_DEG:
+    if np.all(np.abs(xy) <= _MAX_RAD) and _outside(area, crs, degrees) < _NEAR_DEG:
         return (
             Cause.ANGLE_UNIT,
             f"in radians they would be {_degrees(*degrees.tolist())}",
             "give longitude and latitude in degrees",
         )
-    if np.all(np.abs(xy) <= np.flip(_DEGREES)) and _outside(area, crs, xy[::-1]) < _NEAR_DEG:
+    if np.all(np.abs(xy) <= np.flip(_MAX_DEG)) and _outside(area, crs, xy[::-1]) < _NEAR_DEG:
         return (
             Cause.AXES_SWAPPED,
             "with x and y exchanged it fits",
             "put the longitude into x and the latitude into y",
         )
-    if np.any(np.abs(xy) > _DEGREES):
+    if np.any(np.abs(xy) > _MAX_DEG):
         return (
             Cause.CRS,
             "these are not degrees; they seem to be metres",
@@ -113,7 +115,7 @@ def _angular_guess(area: AreaOfUse | None, crs: str, xy: FloatArray) -> Guess | 
 
 
 def _projected_guess(area: AreaOfUse | None, crs: str, xy: FloatArray) -> Guess | None:
-    """Name what easting and northing seem to be."""
+    """Return what the alleged easting and northing seem to be."""
     if _outside(area, crs, xy[::-1]) < _NEAR_DEG:
         return (
             Cause.AXES_SWAPPED,
@@ -127,12 +129,12 @@ def _projected_guess(area: AreaOfUse | None, crs: str, xy: FloatArray) -> Guess 
                 f"these are {words}",
                 "convert them, or give their CRS, such as EPSG:4326, with x = longitude",
             )
-    zoned = np.array([xy[0] % _ZONE, xy[1]])
-    if abs(xy[0]) > _ZONE and _outside(area, crs, zoned) < _NEAR_DEG:
+    zoned = np.array([xy[0] % _ZONE_FACTOR, xy[1]])
+    if abs(xy[0]) > _ZONE_FACTOR and _outside(area, crs, zoned) < _NEAR_DEG:
         return (
             Cause.CRS,
-            f"x seems to begin with a zone number, {xy[0] // _ZONE:.0f}",
-            "leave it out",
+            f"x seems to begin with a zone number, {xy[0] // _ZONE_FACTOR:.0f}",
+            "remove it",
         )
     return None
 
@@ -140,8 +142,8 @@ def _projected_guess(area: AreaOfUse | None, crs: str, xy: FloatArray) -> Guess 
 def _geographic_readings(xy: FloatArray) -> Iterator[tuple[tuple[float, float], str]]:
     x, y = xy.tolist()
     units: tuple[tuple[FloatArray, Callable[[float], float], str], ...] = (
-        (_CIRCLE, lambda angle: float(np.degrees(angle)), "in radians"),
-        (_DEGREES, lambda angle: angle, "in degrees"),
+        (_MAX_RAD, lambda angle: float(np.degrees(angle)), "in radians"),
+        (_MAX_DEG, lambda angle: angle, "in degrees"),
     )
     for limit, degrees, unit in units:
         if np.all(np.abs(xy) <= limit):

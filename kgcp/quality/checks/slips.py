@@ -1,4 +1,7 @@
-"""Slips of the pen that would explain why vehicle and camera disagree, each as its undoing."""
+"""Slips in a flight's inputs that would explain why vehicle and camera disagree.
+
+Each slip has a function that undoes it.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +23,8 @@ from kgcp.quality.checks.course import READINGS
 from kgcp.quality.checks.doubt import Cause
 from kgcp.quality.checks.encounters import Encounters
 
-_FLAT_M = 0.02  # a shorter part of a lever arm can have any sign
-_SMALL_CIRCLE = 0.01  # its radius over its distance
+_MIN_COMPONENT_M = 0.02  # of a lever arm; the sign of a shorter one does not matter
+_CIRCLE_RATIO = 0.01  # radius of an auxiliary circle over its distance
 _UNIT_CIRCLE = np.column_stack([f(2.0 * np.pi * np.arange(16) / 16) for f in (np.cos, np.sin)])
 _OF_VEHICLE = frozenset({"clock", "attitude", "lever arm"})
 _AXES = ("forward", "right", "down")
@@ -29,10 +32,10 @@ _AXES = ("forward", "right", "down")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Slip:
-    """One thing that may have been done wrong."""
+    """One possible slip."""
 
     code: Cause
-    group: str  # of two slips of one group, only one can have been made
+    group: str  # slips of one group exclude each other
     words: str  # what seems to be wrong
     remedy: str  # beginning with a verb
     # returns the encounters as they would be without the slip
@@ -40,12 +43,12 @@ class Slip:
 
     @property
     def is_of_vehicle(self) -> bool:
-        """Whether it moves the target's place by the vehicle, and not that by the camera."""
+        """Whether it changes the target's position by the vehicle, and not that by the camera."""
         return self.group in _OF_VEHICLE
 
 
 def slips(encounters: Encounters) -> Iterator[Slip]:
-    """Yield the slips that may have been made in a flight, the likelier first."""
+    """Yield the slips that are possible in a flight, the likelier first."""
     yield from _of_diameters()
     yield from _of_lever_arm(encounters)
     for words, remedy, convert in READINGS:
@@ -64,7 +67,7 @@ def _of_diameters() -> Iterator[Slip]:
         (2.0, "diameters seem to be radii", "double the diameters in [[target]]"),
         (
             0.5,
-            "diameters seem to be twice too large",
+            "diameters seem to be twice as large as they should be",
             "halve the diameters in [[target]]",
         ),
         (0.3048, "diameters seem to be in feet", "give the diameters in metres"),
@@ -86,17 +89,17 @@ def _of_lever_arm(encounters: Encounters) -> Iterator[Slip]:
     turns = sorted(product((1.0, -1.0), repeat=3), key=lambda signs: (sum(signs) != 1.0, signs))
     for signs in turns:
         turned = [index for index, sign in enumerate(signs) if sign < 0.0]
-        if not turned or any(abs(arm[index]) < _FLAT_M for index in turned):
+        if not turned or any(abs(arm[index]) < _MIN_COMPONENT_M for index in turned):
             continue
         names = " and ".join(_AXES[index] for index in turned)
         words = f"the sign of lever_arm_m ({names}) seems to be wrong"
         if len(turned) == 3:
-            words = "the lever arm seems to lead from the target to the trajectory point"
+            words = "lever_arm_m seems to be from the target to the trajectory point, not to it"
         yield _arm_slip(words, np.array(signs) * arm)
     yield _arm_slip("forward and right of lever_arm_m seem to be exchanged", arm[[1, 0, 2]])
     yield _arm_slip("lever_arm_m seems to be in feet", 0.3048 * arm)
     yield _arm_slip("lever_arm_m seems to be in decimetres", 0.1 * arm)
-    if abs(arm[0] + arm[1]) > _FLAT_M:
+    if abs(arm[0] + arm[1]) > _MIN_COMPONENT_M:
         swapped = np.array([arm[1], arm[0], -arm[2]])
         yield _arm_slip("lever_arm_m seems to be right, forward, up", swapped)
 
@@ -124,7 +127,7 @@ def _with_heading(
 
 
 def clock_slip(shift_s: float, words: str) -> Slip:
-    """Return the slip of clocks that differ: `shift_s` is to be added to frame times."""
+    """Return the slip of clocks that differ by `shift_s`, which is to be added to frame times."""
     return Slip(
         Cause.CLOCK,
         "clock",
@@ -165,8 +168,8 @@ def _of_camera(camera: Camera) -> Iterator[Slip]:
         yield Slip(
             Cause.DISTORTION_SIGN,
             "camera",
-            "k1, k2 … seem to have the opposite sign, as in models that correct distortion"
-            " instead of describing it",
+            "k1, k2 … seem to have the opposite sign, as in models that undo distortion instead of"
+            " describing it",
             "give OpenCV's k1, k2 …, or name the calibration's own file in [camera] file",
             _with_camera(turned),
         )
@@ -187,7 +190,7 @@ def _of_camera(camera: Camera) -> Iterator[Slip]:
         yield Slip(
             Cause.PRINCIPAL_POINT,
             "camera",
-            f"the principal point seems to be counted against {axis}",
+            f"the principal point seems to be counted in the opposite direction of {axis}",
             f"try cx = {point['cx']:.6g}, cy = {point['cy']:.6g}",
             _with_camera(replace(camera, cx=point["cx"], cy=point["cy"])),
         )
@@ -198,26 +201,29 @@ def _with_camera(camera: Camera) -> Callable[[Encounters], Encounters]:
 
 
 def remeasured(encounters: Encounters, camera: Camera) -> Encounters:
-    """Return what another camera would have measured in the same images.
+    """Return what would have been measured with another camera in the same images.
 
-    A small circle where the plate is goes through the one camera into the image, and its ellipse
-    through the other one back into space. NaN where the other camera has no such pixels.
+    A small circle at the plate is projected into the image by the one camera, and its ellipse is
+    projected back into space by the other. NaN if the other camera has no rays for these pixels.
     """
-    places = encounters.in_camera_m.copy()
-    for index, (place, rotation) in enumerate(
+    positions = encounters.in_camera_m.copy()
+    for index, (position, rotation) in enumerate(
         zip(encounters.in_camera_m, encounters.camera_from_plate, strict=True)
     ):
-        radius_m = _SMALL_CIRCLE * float(np.linalg.norm(place))
-        circle = radius_m * _UNIT_CIRCLE @ rotation[:, :2].T + place
+        radius_m = _CIRCLE_RATIO * float(np.linalg.norm(position))
+        circle = radius_m * _UNIT_CIRCLE @ rotation[:, :2].T + position
         points = camera.undistort(encounters.camera.project(circle))
-        places[index] = np.nan
+        positions[index] = np.nan
         if np.isfinite(points).all():
-            places[index] = _place_of_circle(points, radius_m, rotation[:, 2])
-    return replace(encounters, in_camera_m=places, camera=camera)
+            positions[index] = _circle_centre(points, radius_m, rotation[:, 2])
+    return replace(encounters, in_camera_m=positions, camera=camera)
 
 
-def _place_of_circle(points: FloatArray, radius_m: float, normal: FloatArray) -> FloatArray:
-    """Return the centre of a circle by its image (n, 2), normalised; of two, by its normal."""
+def _circle_centre(points: FloatArray, radius_m: float, normal: FloatArray) -> FloatArray:
+    """Return the centre of a circle from its normalised image points (n, 2).
+
+    Of the two solutions, the one whose normal is closer to `normal` is taken.
+    """
     try:
         planes = circle_planes(fit_ellipse(points))
     except Rejection:
@@ -272,8 +278,8 @@ def _of_reference() -> Iterator[Slip]:
         yield Slip(
             Cause.REFERENCE,
             "reference",
-            f"kappa of the reference poses seems to be turned by {turn_deg:g}°",
-            "check which image axis kappa refers to, and whether frames were turned",
+            f"kappa of the reference poses seems to be rotated by {turn_deg:g}°",
+            "check which image axis kappa refers to, and whether frames were rotated",
             _with_turn(turn_deg),
         )
     for factor, unit in ((np.degrees(1.0), "radians"), (0.9, "gon")):
@@ -293,7 +299,7 @@ def _of_reference() -> Iterator[Slip]:
             Cause.REFERENCE,
             "reference",
             f"{word} of the reference poses seem{'s' if word.startswith('the sign ') else ''}"
-            " to be turned",
+            " to be reversed",
             "give omega, phi, kappa of R = Rx(omega) Ry(phi) Rz(kappa), camera to map",
             _with_opk(1.0, signs),
         )
@@ -308,7 +314,7 @@ def _with_opk(
     factor: float, signs: tuple[float, float, float]
 ) -> Callable[[Encounters], Encounters]:
     def undone(encounters: Encounters) -> Encounters:
-        # what turns the map's axes into ENU is the same for any reading of the angles
+        # the rotation from the map's axes to ENU does not depend on how the angles are read
         own = rotation_from_opk(encounters.opk_deg) @ CAMERA_FROM_PHOTO
         enu_from_map = encounters.enu_from_camera @ np.swapaxes(own, 1, 2)
         other = rotation_from_opk(factor * np.array(signs) * encounters.opk_deg)

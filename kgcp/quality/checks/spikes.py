@@ -1,4 +1,4 @@
-"""Epochs of a trajectory that jump away from the others and back."""
+"""Check for epochs of a trajectory that jump away from the others and back."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from kgcp.georef.trajectory import Motion
 from kgcp.georef.unix_time import date_of
 from kgcp.quality.checks.doubt import Cause, Doubt, mild
 
-_SMALLEST_M = 1.5  # coordinates of five decimals in degrees have steps of 1.1 m
+_MIN_JUMP_M = 1.5  # coordinates in degrees with five decimals have steps of 1.1 m
 _MAX_ACCELERATION_M_S2 = 10.0
-_FAR_SDS = 8.0  # of the three coordinates together
-_FAR = 6.0  # times the usual deviation, where standard deviations are too small or not stated
-_SMOOTH_SHARE = 0.25  # of the jump, which the path may bend by without its epoch
-_RETURN_SHARE = 0.5  # of the jump, by which a run of wrong epochs may miss the path on its return
-_LONGEST_RUN_S = 10.0  # two jumps farther apart may be two other solutions of the ambiguities
-_LONGEST_AT_END = 3  # epochs; more of them may be right, and the others wrong
-_LEAST_EPOCHS = 8  # to say which of two parts is the trajectory
+_MAX_SDS = 8.0  # of an epoch's offset, in standard deviations of the position
+_MAX_RATIO = 6.0  # of an offset to the median, if standard deviations are too small or not stated
+_SMOOTH_SHARE = 0.25  # of the jump; the path without the epoch must bend by less
+_RETURN_SHARE = 0.5  # of the jump; a run of wrong epochs must return to the path within this
+_MAX_RUN_S = 10.0  # two jumps farther apart may be two changes of the ambiguities
+_MAX_AT_END = 3  # epochs at an end; if there are more, they may be right and the others wrong
+_MIN_EPOCHS = 8  # in a trajectory, to decide which part is wrong
 
 
 @dataclass(frozen=True, slots=True)
 class _Excursion:
     """Consecutive epochs away from the path of the others."""
 
-    first: int
+    first: int  # number of the epoch
     last: int
-    off_m: float
+    off_m: float  # distance from the path
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class _Path:
 
     @cached_property
     def off_m(self) -> FloatArray:
-        """From the line between the epochs before and after to each epoch (n, 3); 0 at the ends."""
+        """Offsets (n, 3) of epochs from the line between their neighbours; 0 at the ends."""
         off_m = np.zeros_like(self.position_m)
         inner = np.arange(1, len(self.epochs) - 1)
         off_m[1:-1] = self.off_line_m(inner - 1, inner, inner + 1)
@@ -65,53 +65,53 @@ class _Path:
         allowed_m[1:-1] = 0.5 * _MAX_ACCELERATION_M_S2 * steps_s[:-1] * steps_s[1:]
         if self.motion.sd_position_m is not None:
             sd_m = np.linalg.norm(self.motion.sd_position_m[self.epochs], axis=1)
-            allowed_m[1:-1] += _FAR_SDS * np.max([sd_m[:-2], sd_m[1:-1], sd_m[2:]], axis=0)
+            allowed_m[1:-1] += _MAX_SDS * np.max([sd_m[:-2], sd_m[1:-1], sd_m[2:]], axis=0)
         usual_m = float(np.median(off_m[1:-1]))
-        return np.asarray(off_m > np.maximum(allowed_m, max(_SMALLEST_M, _FAR * usual_m)))
+        return np.asarray(off_m > np.maximum(allowed_m, max(_MIN_JUMP_M, _MAX_RATIO * usual_m)))
 
     @cached_property
     def jumps(self) -> IndexArray:
-        """The epochs before each step over which the path jumps: both its ends are far off."""
+        """Epochs before a jump: both ends of the step are far off, in opposite directions."""
         is_opposite = np.sum(self.off_m[:-1] * self.off_m[1:], axis=1) < 0.0
         return np.flatnonzero(self.is_far[:-1] & self.is_far[1:] & is_opposite)
 
     def off_line_m(self, start: IndexArray, epoch: IndexArray, end: IndexArray) -> FloatArray:
-        """Return how epochs (k,) lie from the motion between two others (k, 3); 0 at these."""
+        """Return offsets (k, 3) of epochs (k,) from the line between two others, in time."""
         time_s, position_m = self.time_s, self.position_m
         share = (time_s[epoch] - time_s[start]) / (time_s[end] - time_s[start])
         chord = position_m[end] - position_m[start]
         return np.asarray(position_m[epoch] - position_m[start] - share[:, None] * chord)
 
-    def beside(self, steps: IndexArray, neighbours: IndexArray) -> FloatArray:
-        """Return what steps (k, 3) are longer than at the velocity of neighbouring steps."""
+    def excess_m(self, steps: IndexArray, neighbours: IndexArray) -> FloatArray:
+        """Return steps (k,) minus the motion at the velocity of neighbouring steps (k, 3)."""
         move, steps_s = np.diff(self.position_m, axis=0), np.diff(self.time_s)
         share = (steps_s[steps] / steps_s[neighbours])[:, None]
         return np.asarray(move[steps] - share * move[neighbours])
 
     def without(self, excursions: Sequence[_Excursion]) -> _Path:
         """Return the path without these epochs."""
-        is_left = np.ones(len(self.motion.time_s), dtype=bool)
+        is_kept = np.ones(len(self.motion.time_s), dtype=bool)
         for each in excursions:
-            is_left[each.first : each.last + 1] = False
-        return _Path(self.motion, self.epochs[is_left[self.epochs]])
+            is_kept[each.first : each.last + 1] = False
+        return _Path(self.motion, self.epochs[is_kept[self.epochs]])
 
 
 def check_spikes(motion: Motion) -> Iterator[Doubt]:
-    """Tell epochs that lie far from the path of those before and after.
+    """Yield the doubt about epochs that lie far from the path of those before and after.
 
-    A vehicle that brakes or turns leaves the line between two epochs, too, but without a wrong one
-    the others form a smooth path. Runs of wrong epochs jump away and come back within ten seconds;
-    a jump that stays is another solution of the ambiguities. Of the first and the last three epochs
-    those are named that jump away from all others.
+    A vehicle that brakes or turns also leaves the line between two epochs. A wrong epoch differs in
+    that the path without it is smooth. A run of wrong epochs jumps away and returns within ten
+    seconds; a jump without return is another solution of the ambiguities. Among the first and last
+    three epochs, those that jump away from all others are wrong.
     """
-    found: list[_Excursion] = []
+    excursions: list[_Excursion] = []
     for search in (_single_epochs, _runs, _ends):
-        path = _Path(motion, np.arange(len(motion.time_s))).without(found)
+        path = _Path(motion, np.arange(len(motion.time_s))).without(excursions)
         if len(path.epochs) < 3:
             break
-        found += search(path)
-    if found:
-        yield _doubt(found, motion)
+        excursions += search(path)
+    if excursions:
+        yield _doubt(excursions, motion)
 
 
 def _single_epochs(path: _Path) -> Iterator[_Excursion]:
@@ -128,24 +128,24 @@ def _single_epochs(path: _Path) -> Iterator[_Excursion]:
 
 
 def _runs(path: _Path) -> Iterator[_Excursion]:
-    """Yield what lies between two consecutive jumps of which the second undoes the first."""
+    """Yield the epochs between two consecutive jumps of which the second undoes the first."""
     away, back = path.jumps[:-1], path.jumps[1:]
     lasts_s = path.time_s[back] - path.time_s[away + 1]
-    is_run = (back > away + 1) & (lasts_s <= _LONGEST_RUN_S)
+    is_run = (back > away + 1) & (lasts_s <= _MAX_RUN_S)
     is_run &= (away > 0) & (back < len(path.epochs) - 2)
     away, back = away[is_run], back[is_run]
-    there_m, return_m = path.beside(away, away - 1), path.beside(back, back + 1)
-    jumps_m = np.minimum(*(np.linalg.norm(each, axis=1) for each in (there_m, return_m)))
-    missed_m = np.linalg.norm(there_m + return_m, axis=1)
+    away_m, back_m = path.excess_m(away, away - 1), path.excess_m(back, back + 1)
+    jumps_m = np.minimum(*(np.linalg.norm(each, axis=1) for each in (away_m, back_m)))
+    missed_m = np.linalg.norm(away_m + back_m, axis=1)
     for row in np.flatnonzero(missed_m < _RETURN_SHARE * jumps_m).tolist():
         first, last = path.epochs[away[row] + 1], path.epochs[back[row]]
         yield _Excursion(int(first), int(last), float(jumps_m[row]))
 
 
 def _ends(path: _Path) -> Iterator[_Excursion]:
-    """Yield the first and the last epochs, if the path jumps behind or before them."""
+    """Yield the first epochs if the path jumps after them, and the last ones if it jumps before."""
     last = len(path.epochs) - 1
-    if last + 1 < _LEAST_EPOCHS:
+    if last + 1 < _MIN_EPOCHS:
         return
     off_m = np.linalg.norm(path.off_m, axis=1)
     jumps = set(path.jumps.tolist())
@@ -153,18 +153,18 @@ def _ends(path: _Path) -> Iterator[_Excursion]:
         jumps.add(0)
     if path.is_far[last - 1] and off_m[last - 2] < _SMOOTH_SHARE * off_m[last - 1]:
         jumps.add(last - 1)
-    begin = [step for step in range(_LONGEST_AT_END) if step in jumps]
-    end = [step for step in range(last - _LONGEST_AT_END, last) if step in jumps]
+    begin = [step for step in range(_MAX_AT_END) if step in jumps]
+    end = [step for step in range(last - _MAX_AT_END, last) if step in jumps]
     for step in begin[-1:]:
-        (jump_m,) = np.linalg.norm(path.beside(np.array([step]), np.array([step + 1])), axis=1)
+        (jump_m,) = np.linalg.norm(path.excess_m(np.array([step]), np.array([step + 1])), axis=1)
         yield _Excursion(int(path.epochs[0]), int(path.epochs[step]), float(jump_m))
     for step in end[:1]:
-        (jump_m,) = np.linalg.norm(path.beside(np.array([step]), np.array([step - 1])), axis=1)
+        (jump_m,) = np.linalg.norm(path.excess_m(np.array([step]), np.array([step - 1])), axis=1)
         yield _Excursion(int(path.epochs[step + 1]), int(path.epochs[last]), float(jump_m))
 
 
-def _doubt(found: Sequence[_Excursion], motion: Motion) -> Doubt:
-    worst = max(found, key=lambda each: each.off_m)
+def _doubt(excursions: Sequence[_Excursion], motion: Motion) -> Doubt:
+    worst = max(excursions, key=lambda each: each.off_m)
     count = worst.last - worst.first + 1
     first, last = (_utc(float(motion.time_s[row])) for row in (worst.first, worst.last))
     it = "it" if count == 1 else "them"
@@ -172,13 +172,13 @@ def _doubt(found: Sequence[_Excursion], motion: Motion) -> Doubt:
     if count > 1:
         which = f"the {count} epochs from {first} to {last} UTC lie"
     has_before, has_after = worst.first > 0, worst.last < len(motion.time_s) - 1
-    beside = "before and after" if has_before and has_after else "before" if has_before else "after"
-    total = sum(each.last - each.first + 1 for each in found)
+    where = "before and after" if has_before and has_after else "before" if has_before else "after"
+    total = sum(each.last - each.first + 1 for each in excursions)
     others = total - count
-    less = f", as {others} other{' does' if others == 1 else 's do'} by less" if others else ""
+    less = f", {others} other{'' if others == 1 else 's'} less far" if others else ""
     return mild(
         Cause.TRAJECTORY_SPIKE,
-        f"{which} {worst.off_m:.1f} m from those {beside} {it}{less}: more than the"
+        f"{which} {worst.off_m:.1f} m from those {where} {it}{less}: more than the"
         " trajectory's standard deviations and a vehicle's acceleration allow",
         f"delete {'the epoch' if total == 1 else 'these epochs'} from the trajectory's file if"
         f" {'it is' if total == 1 else 'they are'} wrong: points near {it} are displaced",

@@ -1,4 +1,4 @@
-"""Static targets against each other: no pose of the camera is needed."""
+"""Check of static targets against each other, which needs no pose of the camera."""
 
 from __future__ import annotations
 
@@ -17,19 +17,21 @@ from kgcp.georef.target_positions import TargetPosition
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
 from kgcp.quality.number_text import rounded
 
-_CONTRADICTION = 5.0  # standard deviations of a distance between two targets in one frame
-_LEAST_SHARE, _LEAST_FRAMES = 0.25, 2  # of the frames with two targets, that must contradict
-_PRINT_SD = 0.005  # of a distance from the camera: the print, where no more is stated
-_FLOOR_M = 0.002  # of what distorts a distance besides
-_SPEED_M_S = 10.0  # of the camera, while rows are read one after the other
-_MOST_SCALE = 0.02  # of the logarithm of a factor that all distances may have in common
-_LEAST_OF_SCALE = 3  # pairs of targets that tell a common factor from a wrong position
-_NAMED_FRAMES = 3
+# A distance between two targets in one frame contradicts their positions if it is off by more than
+# this number of standard deviations.
+_CONTRADICTION_SDS = 5.0
+_MIN_SHARE, _MIN_FRAMES = 0.25, 2  # of the frames with two targets, that must contradict
+_PRINT_SD = 0.005  # relative, of distances from the camera, unless a larger one is stated
+_OTHER_SD_M = 0.002  # of a distance, by all other errors
+_SPEED_M_S = 10.0  # of the camera, while a rolling shutter reads the frame
+_MAX_LOG_SCALE = 0.02  # of a common factor of all distances
+_MIN_PAIRS = 3  # of targets, that distinguish a common factor from a wrong position
+_MAX_NAMED = 3  # measurements in a message
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pair:
-    """The distance of two targets in one frame."""
+    """The distance between two targets in one frame."""
 
     frame: str
     names: tuple[str, str]
@@ -43,24 +45,24 @@ def check_static_targets(
 ) -> Iterator[Doubt]:
     """Compare the distances between static targets in every frame with those of their positions.
 
-    A factor that all distances have in common, of prints or focal length, is taken out, if enough
-    distances tell it from a wrong position.
+    A common factor of all distances, due to prints or focal length, is removed if enough distances
+    distinguish it from a wrong position.
 
     Parameters
     ----------
     positions : mapping of str to TargetPosition
-        Of the static targets, in the ENU frame.
+        Positions of the static targets in the ENU frame.
     """
     pairs = _pairs(sightings, positions, camera)
     if not pairs:
         return
     scale = _common_scale(pairs)
-    if not _is_of_all(pairs, scale):
+    if not _is_common(pairs, scale):
         scale = 1.0
-    if abs(math.log(scale)) > _MOST_SCALE:
-        yield _of_scale(scale)
+    if abs(math.log(scale)) > _MAX_LOG_SCALE:
+        yield _scale_doubt(scale)
         return
-    wrong = {pair for pair in pairs if abs(_off_m(pair, scale)) > _CONTRADICTION * pair.sd_m}
+    wrong = {pair for pair in pairs if abs(_off_m(pair, scale)) > _CONTRADICTION_SDS * pair.sd_m}
     by_names: dict[tuple[str, str], list[_Pair]] = defaultdict(list)
     for pair in pairs:
         by_names[pair.names].append(pair)
@@ -68,13 +70,13 @@ def check_static_targets(
     contradicting = {
         names
         for names, frames in bad.items()
-        if len(frames) >= min(_LEAST_FRAMES, len(by_names[names]))
-        and len(frames) >= _LEAST_SHARE * len(by_names[names])
+        if len(frames) >= min(_MIN_FRAMES, len(by_names[names]))
+        and len(frames) >= _MIN_SHARE * len(by_names[names])
     }
     if contradicting:
-        yield _of_targets(by_names, bad, contradicting, scale)
+        yield _target_doubt(by_names, bad, contradicting, scale)
     else:
-        yield from _of_frames(pairs, wrong)
+        yield from _frame_doubts(pairs, wrong)
 
 
 def _pairs(
@@ -87,21 +89,21 @@ def _pairs(
             by_frame[each.frame][each.target] = each
     return [
         pair
-        for frame, seen in by_frame.items()
-        for names in combinations(sorted(seen), 2)
-        if (pair := _pair(frame, names, seen, positions, camera)) is not None
+        for frame, sighting_of in by_frame.items()
+        for names in combinations(sorted(sighting_of), 2)
+        if (pair := _pair(frame, names, sighting_of, positions, camera)) is not None
     ]
 
 
 def _pair(
     frame: str,
     names: tuple[str, str],
-    seen: Mapping[str, Sighting],
+    sighting_of: Mapping[str, Sighting],
     positions: Mapping[str, TargetPosition],
     camera: Camera,
 ) -> _Pair | None:
-    """Return the distance of two targets and its deviation; None: both are at one place."""
-    first, second = (seen[name] for name in names)
+    """Return the distance between two targets; None if it is 0, or if a pose is missing."""
+    first, second = (sighting_of[name] for name in names)
     if first.pose is None or second.pose is None:
         return None
     between = second.pose.translation_m - first.pose.translation_m
@@ -110,7 +112,7 @@ def _pair(
     if not measured_m > 0.0:
         return None
     rows = second.rows_since_middle(camera) - first.rows_since_middle(camera)
-    variance = _FLOOR_M**2 + (_SPEED_M_S * camera.readout_s * rows) ** 2
+    variance = _OTHER_SD_M**2 + (_SPEED_M_S * camera.readout_s * rows) ** 2
     along = between / measured_m
     for sighting, pose in ((first, first.pose), (second, second.pose)):
         share = max(_PRINT_SD, (sighting.sd_common_distance_m or 0.0) / sighting.distance_m)
@@ -124,7 +126,7 @@ def _pair(
 
 
 def _common_scale(pairs: Sequence[_Pair]) -> float:
-    """Return the median ratio of measured and stated distances, weighted by how well it shows."""
+    """Return the median ratio of measured and stated distances, weighted by its precision."""
     apart = [pair for pair in pairs if pair.stated_m > 0.0]
     if not apart:
         return 1.0
@@ -135,32 +137,32 @@ def _common_scale(pairs: Sequence[_Pair]) -> float:
     return float(ratios[order][half])
 
 
-def _is_of_all(pairs: Sequence[_Pair], scale: float) -> bool:
+def _is_common(pairs: Sequence[_Pair], scale: float) -> bool:
     """Tell whether most distances agree better with a factor, not only those of a single target.
 
-    A wrong position has an effect on the distances to its target alone.
+    A wrong position affects only the distances to its own target.
     """
     by_names: dict[tuple[str, str], list[bool]] = defaultdict(list)
     for pair in pairs:
         off_m = abs(_off_m(pair, scale))
-        agrees = off_m < min(abs(_off_m(pair, 1.0)), _CONTRADICTION * pair.sd_m)
+        agrees = off_m < min(abs(_off_m(pair, 1.0)), _CONTRADICTION_SDS * pair.sd_m)
         by_names[pair.names].append(agrees)
     agreeing = [names for names, agrees in by_names.items() if 2 * sum(agrees) > len(agrees)]
     return (
-        len(agreeing) >= _LEAST_OF_SCALE
+        len(agreeing) >= _MIN_PAIRS
         and 2 * len(agreeing) > len(by_names)
         and not set.intersection(*(set(names) for names in agreeing))
     )
 
 
-def _of_scale(scale: float) -> Doubt:
-    """Return the doubt about all distances alike."""
+def _scale_doubt(scale: float) -> Doubt:
+    """Return the doubt about a common factor of all distances."""
     return grave(
         Cause.DISTANCE_SCALE,
         f"static targets are {100.0 * abs(scale - 1.0):.2g} %"
-        f" {'further from' if scale > 1.0 else 'nearer to'} each other by their images than by"
+        f" {'farther from' if scale > 1.0 else 'closer to'} each other in the images than by"
         " position_m",
-        "look at their diameters and at the units of position_m",
+        "check their diameters and the units of position_m",
         {"scale": scale},
     )
 
@@ -169,7 +171,7 @@ def _off_m(pair: _Pair, scale: float) -> float:
     return pair.measured_m / scale - pair.stated_m
 
 
-def _of_targets(
+def _target_doubt(
     by_names: Mapping[tuple[str, str], Sequence[_Pair]],
     bad: Mapping[tuple[str, str], Sequence[_Pair]],
     contradicting: set[tuple[str, str]],
@@ -188,30 +190,30 @@ def _of_targets(
     return grave(
         Cause.STATIC_TARGETS,
         f"static targets: {worst[0]} and {worst[1]} are {rounded(abs(off_m))} m"
-        f" {'further from' if off_m > 0.0 else 'nearer to'} each other by their images than by"
+        f" {'farther from' if off_m > 0.0 else 'closer to'} each other in the images than by"
         f" position_m, in {len(bad[worst])} of {len(by_names[worst])} frames;"
         f" {_and(blamed)} contradict{'s' * (len(blamed) == 1)} most others",
-        "look at position_m, at the names, and whether one was moved: 'kgcp place' and"
+        "check position_m, the names, and whether a target was moved; 'kgcp place' and"
         " 'kgcp orient' show more",
         {"off_m": off_m, "frames": float(len(bad[worst]))},
     )
 
 
-def _of_frames(pairs: Sequence[_Pair], wrong: AbstractSet[_Pair]) -> Iterator[Doubt]:
-    """Yield the doubt about targets in single frames that contradict most others there."""
-    seen, against = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
+def _frame_doubts(pairs: Sequence[_Pair], wrong: AbstractSet[_Pair]) -> Iterator[Doubt]:
+    """Yield the doubt about targets that contradict most others in single frames."""
+    distances, against = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
     for pair in pairs:
         for name in pair.names:
-            seen[pair.frame, name] += 1
+            distances[pair.frame, name] += 1
             against[pair.frame, name] += pair in wrong
-    lone = [key for key, count in against.items() if count >= 2 and 2 * count > seen[key]]
+    lone = [key for key, count in against.items() if count >= 2 and 2 * count > distances[key]]
     if not lone:
         return
-    words = ", ".join(f"{name} in {frame}" for frame, name in lone[:_NAMED_FRAMES])
-    more = f" and {len(lone) - _NAMED_FRAMES} more" if len(lone) > _NAMED_FRAMES else ""
+    words = ", ".join(f"{name} in {frame}" for frame, name in lone[:_MAX_NAMED])
+    more = f" and {len(lone) - _MAX_NAMED} more" if len(lone) > _MAX_NAMED else ""
     yield mild(
         Cause.SINGLE_FRAMES,
-        f"static targets: {words}{more} contradict their distances to most others",
+        f"static targets: {words}{more} do not fit their distances to most others",
         "look at them with 'kgcp detect --overlay', and leave them out (--exclude)",
         {"measurements": float(len(lone))},
     )

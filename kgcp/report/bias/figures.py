@@ -208,7 +208,7 @@ def error_over_image(numbers: BiasNumbers, camera: Camera) -> Picture:
 
 def flight_map(numbers: BiasNumbers) -> Picture:
     """Draw where the cameras were, and where the target was, coloured by the error."""
-    places = np.array([pair.place_m for pair in numbers.compared])
+    places = np.array([pair.target_m for pair in numbers.compared])
     cameras = np.array([pair.camera_m for pair in numbers.compared])
     with sheet(4.8) as figure:
         axes = figure.subplots()

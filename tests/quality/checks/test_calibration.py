@@ -24,10 +24,10 @@ def test_cameras_in_pixels_raise_no_doubt() -> None:
 @pytest.mark.parametrize(
     ("numbers", "code", "words"),
     [
-        ({"fx": 8.8, "fy": 8.8}, Cause.FOCAL_LENGTH, "is this in millimetres?"),
-        ({"fx": 8800.0 * 6, "fy": 8800.0 * 6}, Cause.FOCAL_LENGTH, "is this in micrometres?"),
-        ({"fy": 1091.0}, Cause.FOCAL_LENGTH, "no sensor with square pixels"),
-        ({"cx": 6.2, "cy": -4.1}, Cause.PRINCIPAL_POINT, "divided by the size of a pixel"),
+        ({"fx": 8.8, "fy": 8.8}, Cause.FOCAL_LENGTH, "are they in millimetres?"),
+        ({"fx": 8800.0 * 6, "fy": 8800.0 * 6}, Cause.FOCAL_LENGTH, "are they in micrometres?"),
+        ({"fy": 1091.0}, Cause.FOCAL_LENGTH, "any sensor with square pixels"),
+        ({"cx": 6.2, "cy": -4.1}, Cause.PRINCIPAL_POINT, "in mm by the size of a pixel"),
         ({"cx": 0.0, "cy": 0.0}, Cause.PRINCIPAL_POINT, "half the frame's size"),
         ({"cx": 1212.4, "cy": 892.2}, Cause.CALIBRATION_SIZE, "of double size"),
         ({"cx": 303.0, "cy": 223.0}, Cause.CALIBRATION_SIZE, "of half size"),
@@ -47,7 +47,7 @@ def test_an_upright_calibration_is_told() -> None:
 
 @pytest.mark.parametrize(
     ("diameter", "words"),
-    [(35.4, "0.899 m if these are inches"), (90.0, "0.9 m if these are centimetres"), (0.009, "")],
+    [(35.4, "0.899 m if it is in inches"), (90.0, "0.9 m if it is in centimetres"), (0.009, "")],
 )
 def test_diameters_of_other_units_are_told(diameter: float, words: str) -> None:
     ring = Ring("A", diameter, diameter / 2, diameter / 1.4, diameter / 7, (0.0, 43.0))
@@ -59,9 +59,9 @@ def test_diameters_of_other_units_are_told(diameter: float, words: str) -> None:
 @pytest.mark.parametrize(
     ("ratio", "dot_share", "dots", "words"),
     [
-        (0.39, 0.5, 4, "is 0.39 of the outer one"),
-        (0.71, 0.5, 4, "is 0.71 of the outer one"),
-        (0.4, 0.73, 6, "take 34% of the ring"),
+        (0.39, 0.5, 4, "is 0.39 times the outer one"),
+        (0.71, 0.5, 4, "is 0.71 times the outer one"),
+        (0.4, 0.73, 6, "cover 34% of the ring"),
         (0.4, 0.7, 6, ""),
         (0.4, 0.57, 6, ""),
         (0.5, 0.57, 4, ""),

@@ -41,9 +41,9 @@ def test_whole_seconds_are_told() -> None:
         (37.0, "the frames' times seem to be TAI"),
         (7200.0, "local time; 2 h earlier"),
         (-5.5 * 3600.0, "local time; 5.5 h later"),
-        (3600.0 + 18.0, "local time, and of GPS"),
-        (86_400.0, "another day"),
-        (-604_800.0, "another GPS week"),
+        (3600.0 + 18.0, "a time zone and by GPS minus UTC"),
+        (86_400.0, "different days"),
+        (-604_800.0, "different GPS weeks"),
         (1024 * 604_800.0, "modulo 1024"),
         (3 * 604_800.0, "21 days, 3 GPS weeks, apart"),
         (40 * 86_400.0, "40 days apart"),
@@ -99,6 +99,7 @@ def test_frames_with_the_time_of_another_are_counted() -> None:
     assert not [*check_same_times(times_s)]
     (doubt,) = check_same_times(times_s | {"3 (1).jpg": START_S + 3, "4.tif": START_S + 4})
     assert (doubt.code, doubt.is_grave) == (Cause.SAME_TIMES, False)
-    assert "2 of 7 frames have the time of another frame, such as 3.jpg that of 3 (1).jpg" in (
-        doubt.sentence
+    assert (
+        "2 of 7 frames have the time of another frame; 3.jpg, for example, has that of 3 (1).jpg"
+        in (doubt.sentence)
     )

@@ -52,7 +52,7 @@ def test_headings_along_the_course_raise_no_doubt() -> None:
         (lambda h: np.radians((h + 180.0) % 360.0 - 180.0), Cause.ANGLE_UNIT, "in radians"),
         (lambda h: h / 0.9, Cause.ANGLE_UNIT, "in gon"),
         (lambda h: h + 90.0, Cause.HEADING, "90° ahead of the course"),
-        (lambda h: 47.0 + 2.0 * h, Cause.HEADING, "no other reading of the angles fits"),
+        (lambda h: 47.0 + 2.0 * h, Cause.HEADING, "no other convention fits"),
     ],
 )
 def test_the_reading_that_fits_is_named(

@@ -62,9 +62,9 @@ def test_reference_poses_with_deviations_of_zero_are_doubted() -> None:
 @pytest.mark.parametrize(
     ("factors", "words"),
     [
-        (1000.0, "are 20 m (median), as millimetres would be"),
-        (0.02, "are 0.0004 m (median), as variances or degrees"),
-        ([1e-5, 1e-5, 1.0], "are 2e-07 m (median), as variances or degrees"),
+        (1000.0, "are 20 m (median), which suggests millimetres"),
+        (0.02, "are 0.0004 m (median), which suggests variances, or"),
+        ([1e-5, 1e-5, 1.0], "are 2e-07 m (median), which suggests variances, or"),
     ],
 )
 def test_deviations_of_another_unit_are_doubted(factors: FloatArray, words: str) -> None:
@@ -78,6 +78,8 @@ def test_deviations_of_the_vehicle_in_thousandths_are_doubted() -> None:
     assert not [*check_vehicle_deviations(usual)]
     wrong = VehicleSettings(sd_lever_arm_m=(3.0, 3.0, 5.0), sd_time_s=1.0)
     arm, time = check_vehicle_deviations(wrong)
-    assert arm.sentence.startswith("[vehicle] sd_lever_arm_m is 5 m, which makes all points as unc")
+    assert arm.sentence.startswith(
+        "[vehicle] sd_lever_arm_m is 5 m, which makes all points very unc"
+    )
     assert arm.remedy == "give it in m, not in mm"
     assert time.sentence.startswith("[vehicle] sd_time_s is 1 s")

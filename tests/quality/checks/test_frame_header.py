@@ -22,7 +22,7 @@ def test_frames_of_the_camera_raise_no_doubt() -> None:
     ("size", "words"),
     [
         ((3000, 4000), "exchange width and height"),
-        ((2000, 1500), "this one is 2 times as large"),
+        ((2000, 1500), "is of frames 2 times as large"),
         ((3000, 3000), "give the calibration of these frames"),
     ],
 )
@@ -43,7 +43,7 @@ def test_two_cameras_and_two_zooms_are_named() -> None:
     others = [replace(DJI[0], frame="b.jpg", camera="SONY ILCE-7RM4")]
     (doubt,) = check_frames([*DJI, *others], CAMERA)
     assert doubt.code is Cause.TWO_CAMERAS
-    assert "1 of SONY ILCE-7RM4 with 3.61 mm, such as b.jpg" in doubt.sentence
+    assert "1 from SONY ILCE-7RM4 with 3.61 mm, such as b.jpg" in doubt.sentence
     focused = [replace(DJI[0], frame="c.jpg", focal_mm=3.65)]
     assert not [*check_frames([*DJI, *focused], CAMERA)]
     zoomed = [replace(DJI[0], frame="c.jpg", focal_mm=7.2)]

@@ -25,11 +25,11 @@ def target(outer_m: float = 0.9, inner_ratio: float = 0.5, white_share: float = 
     [
         (0.5, 0.1, ""),
         (0.4, 0.1, ""),
-        (0.38, 0.1, "is 0.38 of the outer one, and many rings beyond 0.4 to 0.7 are not found"),
+        (0.38, 0.1, "is 0.38 times the outer one; outside 0.4 to 0.7, many rings are not found"),
         (0.7, 0.1, ""),
-        (0.72, 0.1, "is 0.72 of the outer one"),
+        (0.72, 0.1, "is 0.72 times the outer one"),
         (0.5, 0.32, ""),
-        (0.5, 0.35, "the dots of 'A' take 35% of the ring, and many are not found"),
+        (0.5, 0.35, "the dots of 'A' cover 35% of the ring; many such rings are not found"),
     ],
 )
 def test_layouts_that_are_hard_to_find_are_told(
@@ -46,8 +46,8 @@ def test_layouts_that_are_hard_to_find_are_told(
         (0.03, ""),
         (7.0, ""),
         (0.01, "an outer diameter of 0.01 m"),
-        (24.0, "24 m (0.61 m if these are inches, 0.24 m if these are centimetres)"),
-        (90.0, "90 m (2.29 m if these are inches, 0.9 m if these are centimetres)"),
+        (24.0, "24 m (0.61 m if it is in inches, 0.24 m if it is in centimetres)"),
+        (90.0, "90 m (2.29 m if it is in inches, 0.9 m if it is in centimetres)"),
     ],
 )
 def test_diameters_in_other_units_are_told(outer_m: float, words: str) -> None:

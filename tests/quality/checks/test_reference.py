@@ -42,9 +42,19 @@ def test_cameras_above_the_vehicle_raise_no_doubt() -> None:
 @pytest.mark.parametrize(
     ("camera", "ground", "code", "words"),
     [
-        (PLACE[[1, 0, 2]], PLACE, Cause.AXES_SWAPPED, "poses, or else of the trajectory, exch"),
-        (PLACE, PLACE[[1, 0, 2]], Cause.AXES_SWAPPED, "poses, or else of the trajectory, exch"),
-        (np.radians(PLACE), PLACE, Cause.ANGLE_UNIT, "of the poses in radians"),
+        (
+            PLACE[[1, 0, 2]],
+            PLACE,
+            Cause.AXES_SWAPPED,
+            "poses, or those of the trajectory, are exch",
+        ),
+        (
+            PLACE,
+            PLACE[[1, 0, 2]],
+            Cause.AXES_SWAPPED,
+            "poses, or those of the trajectory, are exch",
+        ),
+        (np.radians(PLACE), PLACE, Cause.ANGLE_UNIT, "of the poses are in radians"),
         (PLACE + np.array([1.0, 0.0, 0.0]), PLACE, Cause.REFERENCE, "74.34 km apart"),
         (PLACE - np.array([0.0, 0.0, 100.0]), PLACE, Cause.HEIGHTS, "40.0 m below the vehicle"),
     ],
@@ -65,6 +75,6 @@ def test_poses_of_other_frames_or_that_see_nothing_are_told() -> None:
     assert not [*check_visibility(names, names, np.array([20.0]))]
     assert not [*check_visibility(names, names, None)]
     (doubt,) = check_visibility(names, ["DJI_0.jpg"], None)
-    assert "'0.jpg', but the frames are named like 'DJI_0.jpg'" in doubt.sentence
+    assert "'0.jpg', a frame 'DJI_0.jpg'" in doubt.sentence
     (doubt,) = check_visibility(names, names, np.array([]))
     assert "the target is in no frame" in doubt.sentence

@@ -149,7 +149,7 @@ def test_the_pattern_of_a_disagreement_is_told(
 def test_what_has_no_pattern_is_said_so(encounters: Encounters) -> None:
     noise = np.random.default_rng(5).standard_normal(encounters.centre_m.shape)
     doubt = unexplained(moved(encounters, noise))
-    assert "which no single cause explains" in doubt.sentence
+    assert "no single cause explains this" in doubt.sentence
     assert causes_of(moved(encounters, noise)) == ()
 
 

@@ -44,7 +44,7 @@ def test_all_such_epochs_are_counted() -> None:
     position_m[[100, 300, 400], 0] += [5.0, -30.0, 8.0]
     (doubt,) = check_spikes(motion(time_s, position_m))
     assert "lies 30.0 m from" in doubt.sentence
-    assert "as 2 others do by less" in doubt.sentence
+    assert "2 others less far" in doubt.sentence
 
 
 @pytest.mark.parametrize("rate_hz", [5.0, 20.0, 100.0])
@@ -88,7 +88,7 @@ def test_single_epochs_and_runs_are_counted_together() -> None:
     position_m[-2:, 2] += 4.0
     (doubt,) = check_spikes(motion(time_s, position_m))
     assert "the epoch of 2026-06-16 08:15:" in doubt.sentence
-    assert "as 8 others do by less" in doubt.sentence
+    assert "8 others less far" in doubt.sentence
     assert doubt.figures["epochs"] == 9.0
 
 
