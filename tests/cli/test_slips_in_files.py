@@ -76,10 +76,14 @@ TOMLS = {
     "[target] twice": (
         "[[target]]",
         "[target]",
-        r"\[target\] stands twice; head every target \[\[",
+        r"\[target\] is given twice; head every target \[\[",
     ),
-    "[camera] twice": ("[frames]", "[camera]\n[frames]", r"\[camera\] stands twice; put all its"),
-    "key twice": ("fx = 1903.0", "fx = 1.0\nfx = 2.0", "'fx = 2.0': its key or table stands twice"),
+    "[camera] twice": ("[frames]", "[camera]\n[frames]", r"\[camera\] is given twice; put all its"),
+    "key twice": (
+        "fx = 1903.0",
+        "fx = 1.0\nfx = 2.0",
+        "'fx = 2.0': its key or table is given twice",
+    ),
     "backslash": ("vehicle.csv", r"data\vehicle.csv", "has a backslash in a text; write / instead"),
     "drive": ("vehicle.csv", r"C:\Users\vehicle.csv", "has a backslash in a text; write / instead"),
     "tab": ("vehicle.csv", r"data\track.csv", r"trajectory: 'data.track.csv' has a backslash; wri"),

@@ -126,7 +126,7 @@ TIMES_FILES: Mapping[str, tuple[str | bytes, str]] = {
     "times without a column": ("frame\na.png\n", "lacks the columns time"),
     "a time that is no number": ("frame,time\na.png,nan\n", "'nan' is not a time"),
     "a time of 1e999": ("frame,time\na.png,1e999\n", "is out of range"),
-    "a time twice": (TIMES + TIMES.splitlines()[1], "stands in line 2 too"),
+    "a time twice": (TIMES + TIMES.splitlines()[1], "is also in line 2"),
     "a time of nowhere": ("frame,time\na.png,2026-06-16T08:15:01\n", "names no time zone"),
     "a time after the calendar": (
         "frame,time\na.png,9999-12-31T23:59:59-23:59\n",
@@ -138,7 +138,7 @@ TIMES_FILES: Mapping[str, tuple[str | bytes, str]] = {
     "a quote without end": ('frame,time\n"a.png,1\n' + "b.png,2\n" * 50_000, "field larger"),
     "marks of very many digits": (f"1 {'9' * 9000} [2400]\n", "lacks the columns frame, time"),
     "marks of a week that never comes": ("1 1.0 [999999999]\n", "none of its 1 numbers"),
-    "one mark twice": ("1 1.0 [2400]\n1 2.0 [2400]\n", "number 1 stands in line 1 too"),
+    "one mark twice": ("1 1.0 [2400]\n1 2.0 [2400]\n", "number 1 is also in line 1"),
     "events of an endless header": ("%" + " a(" * 300_000 + "\n", "lacks the header line"),
     "events of an infinite week": ("%  GPST x(m)\n1e400 1 2\n", "is not a time and numbers"),
     "events of a week of 9s": (f"%  GPST x(m)\n{'9' * 400} 1 2\n", "is not a time and numbers"),
@@ -176,7 +176,7 @@ _SHOT = {"rotation": [0, 0, 0], "translation": [0, 0, 0]}
 POSES: Mapping[str, tuple[str | bytes, str]] = {
     "empty poses": ("", "is not a file of reference poses of a known format"),
     "poses with a NaN": (REFERENCE.replace("560.0", "nan"), "line 2: z is 'nan'"),
-    "poses with a frame twice": (REFERENCE + REFERENCE.splitlines()[1], "stands in line 2 too"),
+    "poses with a frame twice": (REFERENCE + REFERENCE.splitlines()[1], "is also in line 2"),
     "poses that are a picture": (encoded(".png"), "of a known format"),
     "a billion laughs": (
         _LAUGHS + "<document><chunk><cameras>&g;</cameras></chunk></document>",

@@ -29,7 +29,7 @@ possible poses can be told apart, the position of the projection centre in {crs}
 (x is easting or longitude; z {heights}) and omega, phi, kappa in
 degrees against the map's axes: R(camera > map) = Rx(omega) Ry(phi) Rz(kappa), camera axes x right,
 y up, z backward. sd_ and cov_ are the covariance of all six, metres and degrees; empty where the
-trajectory or the measurement has no deviations.
+trajectory or the measurement has no standard deviations.
 
 They are priors, for packages that take no points or to start an adjustment with. They come from
 the vehicle's attitude and how the plate lies in the image, and an error of 0.5 degrees moves the
@@ -48,9 +48,10 @@ def files(points: MapPoints) -> Mapping[str, str]:
     """
     if not points.priors:
         raise KgcpError(
-            "camera-priors: no camera can be oriented: that needs poses of a plate on a vehicle"
-            " with a trajectory, and [vehicle] level_sd_deg and [camera] plumb_sd_deg or reference"
-            " poses that tell the two poses of a circle apart; or leave this format out"
+            "camera-priors: no camera can be oriented. This needs poses of a plate on a vehicle"
+            " with a trajectory, and [vehicle] level_sd_deg with [camera] plumb_sd_deg or reference"
+            " poses to choose between the two poses of a circle; give these, or leave this format"
+            " out"
         )
     rows = []
     every = zip(points.priors, opk_deg(points.priors), opk_covs(points.priors), strict=True)

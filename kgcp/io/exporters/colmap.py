@@ -19,8 +19,8 @@ _COLUMNS = "image,x,y,z,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz"
 _HOWTO = """\
 COLMAP
 
-COLMAP takes no control points and no distances. What it takes are camera positions with their
-covariance, here from the plate and its vehicle's attitude, for the images that show the target.
+COLMAP takes no control points and no distances. It takes camera positions with their covariance,
+here from the plate and its vehicle's attitude, for the images that show the target.
 
 1. colmap feature_extractor --database_path database.db --image_path frames
    (images go by their path below that folder, as in pose_priors.csv)
@@ -31,8 +31,8 @@ covariance, here from the plate and its vehicle's attitude, for the images that 
 4. colmap pose_prior_mapper --database_path database.db --image_path frames --output_path sparse
    without --overwrite_priors_covariance, which would discard the covariances.
 
-Or, after an ordinary reconstruction, by positions alone that all have the same weight; the error is
-how far from its place a camera may lie [m]:
+Or, after an ordinary reconstruction, by positions only, which then all have the same weight; the
+error is the largest distance of a camera from its position [m]:
   colmap model_aligner --input_path sparse/0 --output_path aligned \
     --ref_images_path reference.txt --ref_is_gps 0 --alignment_max_error 1
 
@@ -65,7 +65,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
     if not reference:
         raise KgcpError(
             f"{_FOLDER}: there is no camera position with a covariance, and COLMAP takes nothing"
-            " else; that needs poses of a plate on a vehicle that are told apart (ambiguity), and"
+            " else; this needs unambiguous poses of a plate on a vehicle (column ambiguity), and"
             " sd_roll_deg, sd_pitch_deg, sd_heading_deg and sd_x, sd_y, sd_z in its trajectory"
         )
     script = resources("kgcp.io.exporters").joinpath("scripts/colmap_pose_priors.txt")

@@ -53,8 +53,8 @@ Copy gcp_list.txt into the project's folder; ODM finds it there. Or name it:
   --gps-accuracy M   how well the positions in the images' EXIF are known [m]; 3 by default.
 
 geo.txt, if it is here, has camera positions from the plate and its vehicle's attitude, for
-the images that show the target. How good they are, their accuracies say. Use it with --geo PATH
-only where the images' own positions are worse; other images keep their own.
+the images that show the target, with their accuracies. Use it with --geo PATH only where the
+images' own positions are worse; other images keep their own.
 
 z is {heights}, written in metres. ODM uses it as it is, and the
 images' own heights, too: where these are of another kind, the two are tens of metres apart.

@@ -56,8 +56,8 @@ project.opf names the files beside it:
   scene_reference_frame.json  the project's CRS; it is missing if the points have degrees, which
                               OPF does not process: export them with kgcp export-gcp --crs
 
-Programs weigh marks by their accuracies and points by their sigmas. OPF holds no correlations. Its
-scale constraints join two control points and no cameras: the distances find no place in it.
+Programs weight marks by their accuracies and points by their sigmas. OPF holds no correlations, and
+takes no distances, because its scale constraints join two control points, never a camera.
 
 {marks}
 """

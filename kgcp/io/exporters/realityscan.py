@@ -42,8 +42,8 @@ RealityScan 2, RealityCapture
 
 RealityScan wants two or more measurements of a point: a static target has them, a moving point has
 one only. What a single one does is not documented: check it by ground test points. Every mark has
-the weight of its own accuracy [px]. RealityScan ignores correlations; its distance constraints join
-two control points and no cameras: the distances find no place in it.
+the weight of its own accuracy [px]. RealityScan ignores correlations. Its distance constraints join
+two control points, never a camera, so that it cannot use the distances.
 
 {marks}
 """

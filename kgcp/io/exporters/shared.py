@@ -28,11 +28,11 @@ ATTRIBUTES: Mapping[str, str] = {
 
 _NOTE = """\
 Distances and the focal length: kgcp measures with the calibration of flight.toml. If its focal
-length is wrong by 0.1 %, all distances are wrong by 0.1 %, 8 cm at 80 m, and so with the printed
-diameter. {known}
+length is wrong by 0.1 %, all distances are wrong by 0.1 %, 8 cm at 80 m. The same holds for the
+printed diameter. {known}
 The package has no place for an error that all distances share: their accuracies here are
 sqrt(measured^2 + (share x distance)^2). kgcps.csv has the measured ones. Leave the calibration free
-in the adjustment. If the adjusted focal length is another one, put the new calibration into
+in the adjustment. If the adjusted focal length is different, put the new calibration into
 flight.toml and begin again with kgcp detect.
 """
 
@@ -44,11 +44,11 @@ def attributes(point: Gcp) -> dict[str, object]:
 
 
 def focal_length_note(gcps: Iterable[Gcp]) -> str:
-    """Return lines for a HOWTO: how distances hang on the focal length, and how much in these."""
+    """Return lines for a HOWTO: how distances depend on the focal length, and by how much here."""
     shares = [distance_share(point) for point in gcps if point.sd_common_distance_m]
     if not shares:
         known = (
-            "How well they are known, flight.toml does not say (sd_fx, sd_outer_diameter_m): a\n"
+            "flight.toml does not say how well they are known (sd_fx, sd_outer_diameter_m): a\n"
             f"share of {100.0 * ASSUMED_SHARE:.2g} % is assumed."
         )
     else:
@@ -58,7 +58,7 @@ def focal_length_note(gcps: Iterable[Gcp]) -> str:
 
 
 def marks_note(points: MapPoints) -> str:
-    """Return lines for a HOWTO: that marks are not given the weight they were measured with."""
+    """Return lines for a HOWTO: that marks are weighted less than they were measured."""
     return (
         f"Marks: no standard deviation is below {points.mark_floor_px:g} px (kgcp export-gcp"
         " --mark-floor-px). They are\nmeasured better (kgcps.csv), but no calibration is that good"

@@ -1,9 +1,9 @@
 """Accuracies that an adjustment can use: floors for points and marks, common distance errors.
 
-A ring of 50 px is measured to a thousandth of a pixel. No calibration is that good all over the
-image: a mark with such a weight would have that of ten thousand tie points and bend the block
-around it. Likewise a distance is as good as calibration and print, which are wrong alike in all
-frames; packages have no place for a common error, and take it as one of each distance.
+A ring of 50 px is measured to a thousandth of a pixel, but no calibration is that good all over the
+image. With such an accuracy, a mark would weigh as much as ten thousand tie points, and bend the
+block around it. Likewise, a distance is only as good as calibration and print, whose errors are the
+same in all frames. Packages cannot represent a common error, and treat it as one of each distance.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ _WRITERS: Mapping[str, ModuleType] = {
 }
 
 
-_AS_MEASURED = {"csv", "geojson", "geopackage"}  # formats for people, who weigh for themselves
+_AS_MEASURED = {"csv", "geojson", "geopackage"}  # for people, not for adjustments: no floors
 
 
 def export(points: MapPoints, name: str, folder: Path) -> list[Path]:
@@ -61,7 +61,7 @@ def export(points: MapPoints, name: str, folder: Path) -> list[Path]:
         If there are no points, the format cannot hold them, or a file cannot be written.
     """
     if not points.gcps:
-        raise KgcpError(f"{name}: no points left after selection; select less strictly")
+        raise KgcpError(f"{name}: no points left after selection; relax the limits")
     if name not in _AS_MEASURED:
         points = replace(points, gcps=with_floors(points.gcps, points.mark_floor_px))
     files: Mapping[str, str | bytes] = _WRITERS[name].files(points)

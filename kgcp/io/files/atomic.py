@@ -18,8 +18,8 @@ _WRITERS = 8  # at a time: a disk confirms several files as quickly as one
 def whole_file(path: Path) -> Iterator[Path]:
     """Yield a temporary name in the folder of `path`; rename it at the end.
 
-    What was written is on the disk before it has its name, so that not even a power failure leaves
-    half a file. If anything is raised, the temporary file goes.
+    The content is flushed to the disk before the rename, so that not even a power failure leaves
+    half a file. If anything is raised, the temporary file is deleted.
 
     Raises
     ------

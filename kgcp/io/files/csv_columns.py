@@ -60,7 +60,7 @@ class CsvColumns:
         Raises
         ------
         KgcpError
-            Naming the line of a frame that is empty or stands twice.
+            With the line, if a frame is empty or given twice.
         """
         first_lines: dict[str, int] = {}
         for line, text in zip(self.lines, self.texts["frame"], strict=True):
@@ -69,8 +69,8 @@ class CsvColumns:
                 raise KgcpError(f"{self.path}, line {line}: names no frame; repair the line")
             if first_lines.setdefault(frame, line) != line:
                 raise KgcpError(
-                    f"{self.path}, line {line}: frame {frame!r} stands in line"
-                    f" {first_lines[frame]} too; keep one of them"
+                    f"{self.path}, line {line}: frame {frame!r} is also in line"
+                    f" {first_lines[frame]}; keep one of them"
                 )
         return tuple(first_lines)
 
@@ -248,8 +248,8 @@ def _number(text: str, where: str, decimal: str) -> float:
         raise KgcpError(f"{where} is {text!r}, with a decimal comma; write a point")
     if decimal == "," and "." in text:  # 1.234 would be read as 1,234
         raise KgcpError(
-            f"{where} is {text!r}, with a point, where decimals have a comma; leave out points"
-            " between thousands"
+            f"{where} is {text!r}, with a point, but decimals have a comma in this file; leave out"
+            " points between thousands"
         )
     if not is_sound(value):
         raise KgcpError(f"{where} is {text!r}; give a finite number")

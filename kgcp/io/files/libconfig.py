@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 _MOST_CHARACTERS = 1 << 20
-_MOST_NESTED = 40  # a group in a list in a group: real files have three or four
+_MAX_DEPTH = 40  # of groups in lists in groups; real files have three or four
 _SPACE = r"[ \t\r\n\f]+|(?:\#|//)[^\n]*|/\*.*?\*/"
 _REAL = r"[-+]?(?:\d+\.\d*(?:[eE][-+]?\d+)?|\.\d+(?:[eE][-+]?\d+)?|\d+[eE][-+]?\d+)"
 _TOKEN = re.compile(
@@ -116,8 +116,8 @@ class _Parser:
 
     def _value(self, depth: int) -> object:
         token = self._next
-        if depth > _MOST_NESTED:
-            raise ValueError(f"line {token.line} is nested more than {_MOST_NESTED} times")
+        if depth > _MAX_DEPTH:
+            raise ValueError(f"line {token.line} is nested more than {_MAX_DEPTH} times")
         if self._is_mark("{[("):
             self._next = next(self._tokens)
             if token.text != "{":

@@ -1,4 +1,4 @@
-"""What Windows does in another way than Linux and macOS, each behind one function.
+"""What differs between Windows, Linux and macOS, each behind one function.
 
 The modules of either system are imported by their names, so that a type checker for the other one
 does not look into them.

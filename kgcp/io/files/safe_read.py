@@ -1,7 +1,7 @@
-"""Files from elsewhere, which may be anything: pipes, devices, far too large, or no text at all.
+"""Safe reading of files from elsewhere, which may be pipes, devices, far too large, or binary.
 
-What a flight names is opened only if it is a regular file, or a link to one, and read with a
-limit, so that nothing can block the program or fill the memory.
+A file that a flight names is opened only if it is a regular file, or a link to one. It is read with
+a limit, so that nothing can block the program or fill the memory.
 """
 
 from __future__ import annotations

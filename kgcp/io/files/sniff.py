@@ -100,7 +100,7 @@ class ForeignFile:
         return self.error_at("", problem, remedy)
 
     def error_at(self, where: str, problem: str, remedy: str | None = None) -> KgcpError:
-        """Return the error for one place in the file, to be raised; "" is the whole file."""
+        """Return the error for one place in the file, to be raised; "": the whole file."""
         place = f"{self.path}, {where}" if where else str(self.path)
         return KgcpError(f"{place}: {problem}; {remedy or self.remedy}")
 
@@ -135,7 +135,7 @@ class NamedValues:
     def of(cls, file: ForeignFile, where: str, value: object) -> Self:
         """Return the object, or raise `KgcpError` if the value is not one."""
         if not isinstance(value, dict):
-            raise file.error_at(where, "is no group of named values")
+            raise file.error_at(where, "is not a group of named values")
         return cls(file, where, value)
 
     def error(self, problem: str, remedy: str | None = None) -> KgcpError:

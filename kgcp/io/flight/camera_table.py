@@ -1,4 +1,4 @@
-"""The [camera] table of flight.toml: the camera, how well it is calibrated, and how it hangs."""
+"""The [camera] table of flight.toml: the camera, the accuracy of its calibration, its tilt."""
 
 from __future__ import annotations
 

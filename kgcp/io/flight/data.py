@@ -21,9 +21,9 @@ from kgcp.targets.plain import AnyTarget
 class FlightData:
     """Times of the frames, reference poses of the camera and positions of the targets.
 
-    The last two may come later than the frames: detections need neither, and reference poses are
-    mostly made with the points that kgcp exports. `has_reference` and `has_position_of` tell
-    whether they are there; here, and nowhere else, this is decided.
+    The last two may become available later than the frames: detections need neither, and reference
+    poses mostly come from an adjustment with the points that kgcp exports. `has_reference`
+    and `has_position_of` tell whether they are there; this is decided only here.
 
     Parameters
     ----------

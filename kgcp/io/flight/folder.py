@@ -1,4 +1,4 @@
-"""What lies in a flight's folder before there is a flight.toml: which file is what."""
+"""Recognition of the files in a flight's folder before there is a flight.toml."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def _kinds_of(path: Path) -> _Kinds:
     recognisers = (_kinds_of_log, _kinds_of_table, _kinds_of_adjustment)
     try:
         return next((kinds for recognise in recognisers if (kinds := recognise(file))), ())
-    except (KgcpError, RecursionError):  # unreadable, or damaged: who needs it will say so
+    except (KgcpError, RecursionError):  # unreadable or damaged: its reader will report it
         return ()
 
 

@@ -48,7 +48,7 @@ _MISTAKES: Sequence[tuple[re.Pattern[str], str, str]] = (
 # What tomllib says where the line is not the cause, and what to do.
 _OTHERS: Mapping[str, tuple[str, str]] = {
     "Unclosed array": ("a list before it has no end", "close the list with ]"),
-    "Cannot overwrite a value": ("its key or table stands twice", "keep one of the two"),
+    "Cannot overwrite a value": ("its key or table is given twice", "keep one of the two"),
     "Unterminated string": ("a text has no end", 'close the text with "'),
     "Illegal character": ("a text has no end", 'close the text with "'),
 }
@@ -100,8 +100,8 @@ def _explained(text: str, message: str) -> tuple[str, str]:
     if declared := _DECLARED_TWICE.search(message):
         name = declared[1]
         if name == "target":
-            return f"line {number}: [target] stands twice", "head every target [[target]]"
-        return f"line {number}: [{name}] stands twice", f"put all its keys under one [{name}]"
+            return f"line {number}: [target] is given twice", "head every target [[target]]"
+        return f"line {number}: [{name}] is given twice", f"put all its keys under one [{name}]"
     for pattern, problem, remedy in _MISTAKES:
         if pattern.search(line):
             return f"{where} {problem}", remedy

@@ -76,7 +76,7 @@ def _read_course(table: TomlTable) -> tuple[float, float, float] | None:
         raise table.error(
             absent,
             "is missing",
-            'attitude = "course" and sd_attitude_deg = [roll, pitch, heading] stand together',
+            'attitude = "course" and sd_attitude_deg = [roll, pitch, heading] are needed together',
         )
     if "attitude" not in table:
         return None

@@ -142,7 +142,7 @@ def _read_marks(file: ForeignFile, frames: Sequence[str]) -> FrameTimes:
         if first_lines.setdefault(number, line) != line:
             raise file.error_at(
                 f"line {line}",
-                f"number {number} stands in line {first_lines[number]} too",
+                f"number {number} is also in line {first_lines[number]}",
                 "give the marks of one flight",
             )
         clocks[number] = clock_from_week(np.array(float(match[3])), np.array(float(match[2])))

@@ -88,5 +88,5 @@ def test_a_line_for_excel_is_no_header_and_is_counted(tmp_path: Path) -> None:
 def test_points_between_thousands_are_not_taken_for_decimals(tmp_path: Path, number: str) -> None:
     path = tmp_path / "a.csv"
     path.write_text(f"time;x\n1;{number}\n", encoding="utf-8")
-    with pytest.raises(KgcpError, match=rf"line 2: x is '{number}', with a point, where decimals"):
+    with pytest.raises(KgcpError, match=rf"line 2: x is '{number}', with a point, but decimals"):
         read_csv_columns(path, ("time",), ("x",), (), "", CsvLayout(";", ","))

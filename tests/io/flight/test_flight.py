@@ -225,7 +225,7 @@ def test_what_may_be_left_out_has_the_folder_s_defaults(tmp_path: Path, write: W
         ("[reference]", "[reference", r"is not TOML: .*line 57.*; correct that line"),
         ("fy = 2304\n", "fy = 2304\nfx = 1\n", "is not TOML: .*line 13"),
         ("fy = 2304\n", "fy = 2304,0\n", "is not TOML: line 12, .*; decimals take a point"),
-        ("[reference]", "[vehicle]\n[reference]", r"line \d+: \[vehicle\] stands twice; put all"),
+        ("[reference]", "[vehicle]\n[reference]", r"line \d+: \[vehicle\] is given twice; put all"),
         ('"car.csv"', r'"data\car.csv"', "is not TOML: .*; write / instead of"),
     ],
 )  # fmt: skip

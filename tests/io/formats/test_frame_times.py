@@ -87,7 +87,7 @@ def test_marks_go_over_saturday_midnight(tmp_path: Path, week: str) -> None:
     ("lines", "words"),
     [
         ((MARKS[0], "2\t400372.4"), "line 2: does not begin with number, GPS seconds"),
-        ((MARKS[0], "", MARKS[0]), "line 3: number 1 stands in line 1 too"),
+        ((MARKS[0], "", MARKS[0]), "line 3: number 1 is also in line 1"),
         ((MARKS[0].replace("1\t", "7\t", 1),), "none of its 1 numbers is the last number"),
     ],
 )
@@ -190,9 +190,9 @@ def test_a_table_has_both_notations_and_may_have_more_columns(tmp_path: Path) ->
         ),
         ("#frame,time\na.jpg,1\n", "line 1: begins with '#'; delete comments, and a '#'"),
         ("frame,when\na.jpg,1\n", "line 1: lacks the columns time"),
-        ("frame,time\na.jpg,1\na.jpg,2\n", r"line 3: frame 'a.jpg' stands in line 2 too"),
+        ("frame,time\na.jpg,1\na.jpg,2\n", r"line 3: frame 'a.jpg' is also in line 2"),
         ("frame,time\na.jpg\n", "line 2: has 1 cells, the first line has 2"),
-        ("frame,time\na.jpg,1\n./a.jpg,2\n", r"line 3: frame 'a.jpg' stands in line 2 too"),
+        ("frame,time\na.jpg,1\n./a.jpg,2\n", r"line 3: frame 'a.jpg' is also in line 2"),
         ("frame,time\n,1\n", "line 2: names no frame"),
         ("frame,time\na.jpg,\n", "line 2: time: '' is not a time"),
         ("frame,time\na.jpg,2026-05-04T09:30:05\n", "line 2: .* no time zone"),

@@ -36,7 +36,7 @@ def test_poses_are_read_with_their_deviations(tmp_path: Path) -> None:
 
 def test_a_frame_that_stands_twice_is_refused_with_both_lines(tmp_path: Path) -> None:
     path = _write(tmp_path, _HEADER, "a.jpg,1,2,3,4,5,6", "b.jpg,1,2,3,4,5,6", "a.jpg,1,2,3,4,5,6")
-    with pytest.raises(KgcpError, match=r"line 4: frame 'a\.jpg' stands in line 2"):
+    with pytest.raises(KgcpError, match=r"line 4: frame 'a\.jpg' is also in line 2"):
         read_reference_poses(path)
 
 
