@@ -21,7 +21,7 @@ from kgcp.errors import KgcpError
 if TYPE_CHECKING:
     from kgcp.pipeline.calibration.results import CalibrationResults
 
-# Named here, not imported, because the modules that know them take numpy; a test compares.
+# Repeated here because the modules that define them import numpy; a test compares them.
 POINT_MODELS = ("fixed", "stiff", "free")
 LENSES = ("auto", "radial", "brown", "rational")
 OPERATORS = ("model", "gaussian", "centroid")
@@ -63,7 +63,7 @@ FORMATS = ("opencv", "ros", "metashape", "colmap", "opensfm", "pix4d", "opf", "m
     type=click.Choice(LENSES),
     default="auto",
     show_default=True,
-    help="Terms of distortion: k1 and what is significant, k1 k2, k1 k2 p1 p2 k3, or all eight.",
+    help="Terms of distortion: k1 and the significant ones, k1 k2, k1 k2 p1 p2 k3, or all eight.",
 )
 @click.option(
     "--same-aspect/--free-aspect",
@@ -175,12 +175,12 @@ def command(
         import json
 
         files = [str(path) for path in results.files]
-        told = {
+        file_notes = {
             "files": files,
             "left_out": results.left_out,
             "not_renewed": results.not_renewed,
         }
-        click.echo(json.dumps({**results.summary, **told}))
+        click.echo(json.dumps({**results.summary, **file_notes}))
     if log_json:
         log.event("summary", **results.summary)
     elif not is_quiet:
@@ -188,8 +188,8 @@ def command(
     if results.left_out:
         (why,) = set(results.left_out.values())
         raise KgcpError(
-            f"{', '.join(results.left_out)}: left out, because {why}; all else is written. Choose"
-            " other formats, or calibrate with one focal length",
+            f"{', '.join(results.left_out)}: left out, because {why}; all other files are written."
+            " Choose other formats, or calibrate with one focal length",
             option="same-aspect",
         )
 
@@ -218,4 +218,4 @@ def _report(results: CalibrationResults) -> None:
         click.echo(f"wrote {path}", err=True)
     if results.not_renewed:
         older = ", ".join(results.not_renewed)
-        click.echo(f"left as an earlier calibration wrote them: {older}", err=True)
+        click.echo(f"not updated, from an earlier calibration: {older}", err=True)

@@ -26,8 +26,8 @@ def command(flight: Path | StoredFolder, *, as_json: bool) -> None:
     doubt with its likely cause and the remedy. Takes seconds and writes no file; run it before
     'kgcp detect'.
 
-    The exit code is 1 if there is a grave doubt, that is, if the results would be worthless
-    should it be right.
+    The exit code is 1 if there is a grave doubt: one that, if justified, makes the results
+    worthless.
 
     Example: kgcp check sample_flight
     """

@@ -74,8 +74,8 @@ class Log:
     def progress(self, stage: str, done: int, total: int, found: int) -> None:
         """Move the bar, whose total is the number of frames in all stages.
 
-        A frame that goes through two rounds counts by half after the first. A second look, which
-        few frames need, is told beside the bar.
+        A frame that goes through two rounds counts by half after the first. The progress of a
+        second look, which few frames need, is printed beside the bar.
         """
         is_round = stage in _ROUNDS
         frames = self._frames(stage, done, total)
@@ -195,7 +195,7 @@ def report_stages(summary: DetectionSummary, before_s: float, total_s: float, lo
     Parameters
     ----------
     before_s : float
-        From the start of the program to the begin of the work [s].
+        From the start of the program to the start of the work [s].
     total_s : float
         From the start of the program to now [s].
     """
@@ -232,8 +232,8 @@ def _report_in_words(summary: DetectionSummary, seconds: float, frames_per_s: fl
     lines += _about_times(summary)
     if summary.frames_without_attitude:
         lines.append(
-            f"frames without a camera attitude: {summary.frames_without_attitude}; a level plate"
-            " cannot tell their two poses apart: give [camera] plumb_sd_deg"
+            f"frames without a camera attitude: {summary.frames_without_attitude}; in these,"
+            " a level plate cannot decide between two poses: give [camera] plumb_sd_deg"
         )
     click.echo("\n".join(lines), err=True)
 
@@ -249,7 +249,7 @@ def _about_tone(summary: DetectionSummary) -> str:
 
 
 def _about(reason: str, summary: DetectionSummary) -> str:
-    """Return the commonest detail of a reason, and what to do about it."""
+    """Return the most frequent detail of a reason, and what to do about it."""
     from kgcp.errors import Reason
 
     remedy = Reason.of(reason).remedy

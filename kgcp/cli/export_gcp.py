@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from kgcp.quality.consistency import Consistency
 
 ALL = "all"
-MANY = 12
+MAX_LISTED_FILES = 12  # in one folder; more are counted
 WITH_EXTENSION, WITHOUT_EXTENSION = "with-extension", "without-extension"
 
 
@@ -93,7 +93,7 @@ def _list_formats(context: click.Context, _: click.Parameter, asked: bool) -> No
     metavar="FILE",
     type=click.Path(path_type=Path),
     multiple=True,
-    help="Leave out the frames that this file lists, one in every line, perhaps with a target"
+    help="Leave out the frames that this file lists, one per line, or single targets in them"
     " (frame,target), as the contact sheet of 'kgcp detect --overlay' writes it; may be repeated.",
 )
 @click.option(
@@ -165,7 +165,7 @@ class PointChoice:
 
 @dataclass(frozen=True, slots=True)
 class FileOptions:
-    """Which files are wanted, and how they are to be."""
+    """Which files are wanted, and their options."""
 
     formats: tuple[str, ...]
     mark_floor_px: float
@@ -228,11 +228,13 @@ def _export_several(
     from kgcp.pipeline.workspace import DETECTIONS, results_folder
 
     if not isinstance(out, Path):
-        raise KgcpError(f"{out}: takes one flight only; write the points of several to a disk")
+        raise KgcpError(f"{out}: only for one flight; write the points of several to a local disk")
     read = []
     for flight in flights:
         if not isinstance(flight, Path):
-            raise KgcpError(f"{flight}: several flights are merged on a disk; copy them there")
+            raise KgcpError(
+                f"{flight}: several flights can be merged on a local disk only; copy them there"
+            )
         read.append((read_flight(flight), results_folder(flight) / DETECTIONS))
     merged = merge_gcps(_made(read, choice))
     written = write_merged(merged, out)
@@ -278,8 +280,8 @@ def _export(
         try:
             written += write(name)
         except KgcpError as error:
-            is_of_files = isinstance(error.__cause__, OSError)  # a full disk, and not the format
-            if name in formats or is_of_files:
+            is_file_error = isinstance(error.__cause__, OSError)  # such as a full disk
+            if name in formats or is_file_error:
                 raise
             left_out[name] = str(error)
     return written, left_out
@@ -308,7 +310,7 @@ def _report(
     for name, reason in left_out.items():
         click.echo(f"left out {name}: {reason.removeprefix(f'{name}: ')}", err=True)
     if older:
-        click.echo(f"left as an earlier export wrote them: {', '.join(older)}", err=True)
+        click.echo(f"not updated, from an earlier export: {', '.join(older)}", err=True)
 
 
 def _print_json(
@@ -345,8 +347,8 @@ def _counted(points: GcpSet | MergedGcps) -> str:
 
     checks = sum(point.is_checkpoint for point in points.gcps)
     of_these = f" ({counted(checks, 'check point')})" if checks else ""
-    lost = counted(len(points.skipped), "sighting")
-    return f"{counted(len(points.gcps), 'KGCP')}{of_these}, {lost} left out"
+    skipped = counted(len(points.skipped), "sighting")
+    return f"{counted(len(points.gcps), 'KGCP')}{of_these}, {skipped} left out"
 
 
 def _report_part(part: GcpSet) -> None:
@@ -360,12 +362,14 @@ def _report_part(part: GcpSet) -> None:
 
 
 def _named(written: list[Path]) -> list[str]:
-    """Name files; where a folder has many of them, the folder."""
+    """Return the names of files; many files in one folder are counted instead."""
     from collections import Counter
 
     counts = Counter(path.parent for path in written)
     names = (
-        f"{counts[path.parent]} files in {path.parent}" if counts[path.parent] > MANY else str(path)
+        f"{counts[path.parent]} files in {path.parent}"
+        if counts[path.parent] > MAX_LISTED_FILES
+        else str(path)
         for path in written
     )
     return [*dict.fromkeys(names)]
@@ -387,7 +391,7 @@ def _report_deviations(vehicle: Vehicle | None) -> None:
     elif vehicle is not None and vehicle.motion.sd_attitude_deg is None:
         click.echo(
             "the trajectory has no sd_roll_deg, sd_pitch_deg, sd_heading_deg:"
-            " attitude is taken as free of error",
+            " attitude is taken as exact",
             err=True,
         )
 

@@ -154,13 +154,13 @@ _SELECTION = (
         "--min-score",
         metavar="S",
         type=NumberRange(0.0, 1.0),
-        help="Leave out points whose code matched less well than this score.",
+        help="Leave out points whose code has a lower score than this.",
     ),
     click.option(
         "--min-ambiguity",
         metavar="A",
         type=NumberRange(0.0),
-        help="Leave out points whose two poses are harder to tell apart than this Δχ².",
+        help="Leave out points whose two poses differ by less than this Δχ².",
     ),
     click.option(
         "--min-spacing",
@@ -176,7 +176,7 @@ _SELECTION = (
         metavar="SHARE",
         type=NumberRange(0.0, 1.0),
         default=0.0,
-        help="Declare this share of the points check points, spaced evenly along the track.",
+        help="Make this share of the points check points, spaced evenly along the track.",
     ),
     click.option(
         "--keep-flagged",

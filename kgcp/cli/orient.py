@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from kgcp.pipeline.ground.own_frame import OrientedFrame, PoseT
 
 _MIN_POINTS = 4
-_FEW_FRAMES = 3  # that are named
+_MAX_NAMED = 3  # frames in a message
 
 
 @click.command()
@@ -82,13 +82,14 @@ def command(
     """Orient frames by the static targets in them, without an adjustment.
 
     Computes the camera's pose in every frame with three or more targets that have a position_m, and
-    rejects targets that do not agree. A frame with one ring is oriented once other frames have told
-    how that ring lies. Writes poses.parquet, pose_residuals.parquet and poses.csv to FLIGHT/kgcp.
+    rejects targets that do not agree. A frame with only one ring is oriented if other frames
+    determine how that ring lies. Writes poses.parquet, pose_residuals.parquet and poses.csv to
+    FLIGHT/kgcp.
     poses.csv can be given as [reference] poses. Run 'kgcp detect' first.
 
-    With --device, frames are oriented by plain discs within a closed boundary, whose arrangement
-    tells which is which. With --field, by the discs of a field, as 'kgcp calibrate' finds and names
-    them. 'kgcp detect' is not needed. Writes device_poses.csv or field_poses.csv.
+    With --device, frames are oriented by plain discs within a closed boundary, which are identified
+    by their arrangement. With --field, they are oriented by the discs of a field, which are found
+    as by 'kgcp calibrate'. 'kgcp detect' is not needed. Writes device_poses.csv or field_poses.csv.
 
     \b
     Examples:
@@ -170,20 +171,20 @@ def _report(poses: FlightPoses) -> None:
                     left_out.setdefault(name, []).append(each.frame)
     for name, frames in left_out.items():
         where = ", ".join(frames)
-        if len(frames) > _FEW_FRAMES:
+        if len(frames) > _MAX_NAMED:
             measured = sum(name in each.targets for each in oriented)
-            where = f"{len(frames)} of {measured} frames, {frames[0]} the first"
-            where += "; look at its position_m" if 2 * len(frames) > measured else ""
-        click.echo(f"kgcp: look: {name} left out in {where}", err=True)
+            where = f"{len(frames)} of {measured} frames, first in {frames[0]}"
+            where += "; check its position_m" if 2 * len(frames) > measured else ""
+        click.echo(f"kgcp: doubt: {name} left out in {where}", err=True)
     for doubt in poses.doubts:
-        click.echo(f"kgcp: look: {doubt}", err=True)
+        click.echo(f"kgcp: doubt: {doubt}", err=True)
     if poses.focal_px is not None:
         focal, sd = poses.focal_px
         click.echo(f"focal length {focal:.2f} ± {sd:.2f} px", err=True)
 
 
 def _refuse_together(given: Mapping[str, bool]) -> None:
-    """Refuse what goes with neither a device nor a field, and both of them at once."""
+    """Refuse a device and a field at once, and options that cannot be combined with either."""
     first, *others = (name for name, is_given in given.items() if is_given)
     if others:
         raise click.UsageError(f"{first} takes no {' or '.join(others)}; leave one out")
@@ -267,5 +268,5 @@ def _report_frames(
         outcome = f"not oriented: {each.reason}" if each.pose is None else each.pose.in_words
         click.echo(f"{each.frame}: {outcome}", err=True)
     for doubt in doubts:
-        click.echo(f"kgcp: look: {doubt}", err=True)
+        click.echo(f"kgcp: doubt: {doubt}", err=True)
     click.echo(f"wrote {path}", err=True)

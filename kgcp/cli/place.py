@@ -113,8 +113,8 @@ def command(
     for name, reason in places.placement.skipped.items():
         click.echo(f"not placed: {name}: {reason}", err=True)
     for doubt in places.doubts:
-        click.echo(f"kgcp: look: {doubt}", err=True)
+        click.echo(f"kgcp: doubt: {doubt}", err=True)
     for path in written:
         click.echo(f"wrote {workspace.named(path)}", err=True)
     if older:
-        click.echo(f"left as an earlier run wrote them: {', '.join(older)}", err=True)
+        click.echo(f"not updated, from an earlier run: {', '.join(older)}", err=True)

@@ -171,9 +171,9 @@ def _table(target: AnyTarget, conditions: Conditions, outlooks: Sequence[Outlook
         f" and a radius of {max(least_px, sharp_px):.3g} px."
     )
     if sharp_px > least_px:
-        yield f"found: none below {sharp_px:.3g} px, where so much blur leaves too little."
+        yield f"found: none below {sharp_px:.3g} px, because this blur leaves too little contrast."
     if plain is not None:
-        yield "found: where the frame's pose puts it, on even ground in contrast to it."
+        yield "found: if the frame's pose is known, on even ground that contrasts with the target."
     yield ""
     yield from _aligned(_GROUND_COLUMNS, map(_ground_cells, outlooks))
     yield (

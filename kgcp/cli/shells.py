@@ -1,4 +1,4 @@
-"""What Windows' shells leave to the programs they start: patterns of files, `~`, and slips."""
+"""What shells on Windows leave to programs: file patterns, `~`, and slips in quoting."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ def as_meant(arguments: Iterable[str]) -> list[str]:
     for argument in meant:
         if '" -' in argument:
             raise click.UsageError(
-                f"{argument}: is one argument; leave out the backslash before the quotation mark"
+                f"{argument}: was read as one argument; leave out the backslash before the"
+                " quotation mark"
             )
     return meant
 
@@ -38,7 +39,7 @@ def as_meant(arguments: Iterable[str]) -> list[str]:
 def paths_of(text: str) -> list[Path]:
     """Return the paths that an argument names, sorted: several if it is a pattern with * or ?.
 
-    A pattern that matches nothing stays as it is; who reads it says that it does not exist.
+    A pattern that matches nothing stays as it is; the reader then reports that it does not exist.
     """
     if SHELL_EXPANDS or not {"*", "?"} & set(text):
         return [Path(text)]

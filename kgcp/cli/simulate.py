@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from kgcp.simulation.presets import SimulationSettings
     from kgcp.targets.fields.points import AnyField
 
-# Named here, not imported, because reading the presets takes numpy and scipy; a test compares.
+# Repeated here because the module of the presets imports numpy and scipy; a test compares them.
 PRESET_NAMES = (
     *("clean", "exposure_sweep", "consumer", "blurred", "oblique", "far", "sample"),
     *("shadow", "dirty", "glare", "lens", "phone", "simple_phone", "rolling", "mixed"),

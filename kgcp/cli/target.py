@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from kgcp.targets.layout import Target
     from kgcp.targets.sheets import Paper
 
-# Named here, not imported, because the modules that know them take numpy; a test compares.
+# Repeated here because the modules that define them import numpy; a test compares them.
 FORMATS = ("pdf", "svg", "dxf", "png")
 PAPERS = ("fit", "A4", "A3", "A2", "A1", "A0")
 
@@ -254,12 +254,12 @@ def _draw_field(
     write_bytes(description, field_toml(field).encode())
     files.append(description)
     if as_json:
-        told = {"field": field.name, "discs": len(field.names()), "sheets": len(sheets)}
-        click.echo(json.dumps({**told, "files": [str(path) for path in files]}))
+        counts = {"field": field.name, "discs": len(field.names()), "sheets": len(sheets)}
+        click.echo(json.dumps({**counts, "files": [str(path) for path in files]}))
     if isinstance(field, Field) and field.symmetries():
         warnings.warn(
-            "the field looks the same when it is turned; a [[mark]] in its field.toml, one hollow"
-            " disc, gives it one way up",
+            "the field looks the same when it is rotated; a [[mark]] in its field.toml, one hollow"
+            " disc, makes its orientation unique",
             KgcpWarning,
             stacklevel=2,
         )
@@ -298,8 +298,9 @@ def _report(
     click.echo(f"codes are at least {apart:.1f} dots apart, rotated or mirrored", err=True)
     if apart < LEAST_DISTANCE:
         warnings.warn(
-            f"rotated or mirrored, codes are only {apart:.1f} dots apart: a dirty dot may give one"
-            " target the heading or the name of another; --new proposes better codes",
+            f"rotated or mirrored, codes are only {apart:.1f} dots apart: with a dirty dot, a"
+            " target may get a wrong heading, or be mistaken for another; --new proposes better"
+            " codes",
             KgcpWarning,
             stacklevel=2,
         )

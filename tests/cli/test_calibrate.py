@@ -215,7 +215,7 @@ def test_cameras_of_an_earlier_run_are_named(photos: Path, tmp_path: Path) -> No
     result = run(photos, "--field", photos / "field.toml", "--out", tmp_path, *options, "--json")
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["not_renewed"] == ["opencv"]
-    assert "left as an earlier calibration wrote them: opencv" in result.stderr
+    assert "not updated, from an earlier calibration: opencv" in result.stderr
 
 
 @pytest.mark.usefixtures("_no_figures")

@@ -227,7 +227,7 @@ def test_files_of_an_earlier_export_are_mentioned(flight: FlightFolder) -> None:
     flight.run("export-gcp", "--format", "odm", "--format", "micmac")
     result = flight.run("export-gcp", "--format", "csv", "--min-spacing", "30", "--json")
     assert json.loads(result.stdout)["not_renewed"] == ["odm", "micmac"]
-    assert "left as an earlier export wrote them: odm, micmac" in result.stderr
+    assert "not updated, from an earlier export: odm, micmac" in result.stderr
     result = flight.run("export-gcp", "--format", "odm", "--format", "micmac", "--format", "csv")
     assert "earlier export" not in result.stderr
 

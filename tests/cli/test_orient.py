@@ -264,7 +264,7 @@ def test_a_target_that_is_elsewhere_is_told_once(tmp_path: Path) -> None:
     folder = GroundFlight(wrong={(frame, "B"): np.array([0.5, 0.3, 0.0]) for frame in range(5)})
     result = run("orient", folder.write(tmp_path / "flight"))
     assert result.exit_code == 0, result.stderr
-    told = "B left out in 5 of 12 frames, f_000.png the first\n"
+    told = "B left out in 5 of 12 frames, first in f_000.png\n"
     assert told in result.stderr
     assert result.stderr.count("left out") == 1
 
@@ -485,7 +485,7 @@ def test_a_field_whose_discs_have_another_size_than_stated_is_doubted(
     assert result.exit_code == 0, result.stderr
     doubts = json.loads(result.stdout)["doubts"]
     assert len(doubts) == (1 if words else 0)
-    assert result.stderr.count("kgcp: look: ") == len(doubts)
+    assert result.stderr.count("kgcp: doubt: ") == len(doubts)
     assert words in result.stderr
 
 

@@ -384,7 +384,7 @@ def test_files_of_an_earlier_run_are_named(tmp_path: Path) -> None:
     folder = GroundFlight().write(tmp_path / "flight")
     assert "earlier run" not in run(folder, "--format", "odm").stderr
     result = run(folder, "--format", "csv", "--json")
-    assert "left as an earlier run wrote them: odm\n" in result.stderr
+    assert "not updated, from an earlier run: odm\n" in result.stderr
     assert json.loads(result.stdout)["not_renewed"] == ["odm"]
 
 

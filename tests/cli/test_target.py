@@ -149,7 +149,7 @@ def test_a_field_is_drawn_with_its_field_toml(tmp_path: Path) -> None:
     options = ["--dpi", "100", "--out", str(tmp_path), "--json"]
     result = CliRunner().invoke(main, [*arguments, *options], catch_exceptions=False)
     assert result.exit_code == 0, result.output
-    assert "looks the same when it is turned" in result.stderr
+    assert "looks the same when it is rotated" in result.stderr
     assert json.loads(result.stdout)["discs"] == 54
     field = read_field(str(tmp_path / "field.toml"))
     assert isinstance(field, Field)
