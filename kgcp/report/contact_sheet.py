@@ -1,4 +1,4 @@
-"""The contact sheet: a folder with a page, and a picture and its thumbnail for every ring."""
+"""The contact sheet: a folder with a page, and a picture with a thumbnail for every ring."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from kgcp.report.ring_picture import FULL_SCALE, THUMBNAIL_PX, Pictures
 PAGE = "index.html"
 _PICTURES, _THUMBNAILS = "pictures", "thumbnails"
 DROPPED = "candidate"
-"""Status of a card that no row of the table stands for: a ring that was compared and dropped."""
+"""Status of a card without a row in the table: a ring that was compared and dropped."""
 
 _OWN_NAME = re.compile(r"\d{6,}-\d+\.jpg")
 _MARK = '<meta name="generator" content="kgcp'
-_HEAD = 2000  # characters of a page, in which the mark must be
+_HEAD = 2000  # characters at the beginning of a page that must contain the mark
 
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """Entry of the page for one row of the table, or of a ring that was dropped."""
+    """Entry of the page for one row of the table, or for a ring that was dropped."""
 
     # as in the table; or the status `DROPPED`
     frame: str
@@ -47,7 +47,7 @@ class Card:
 
     @property
     def is_point(self) -> bool:
-        """Whether the row becomes a point, unless the user leaves it out."""
+        """Whether the row becomes a point unless the user excludes it."""
         return self.status == Status.MEASURED and self.instance == 0
 
 
@@ -57,12 +57,13 @@ class ContactSheet:
     Parameters
     ----------
     folder : Path
-        Made if need be.
+        Created if necessary.
 
     Raises
     ------
     KgcpError
-        Here and by all methods, if it cannot be written; here, if it holds another page.
+        If the folder contains a page of another program. Here and in all methods, if it cannot be
+        written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -78,7 +79,7 @@ class ContactSheet:
             raise self._unwritable(error) from error
 
     def clear(self) -> None:
-        """Delete the page of another run, which does not show the cards that follow."""
+        """Delete the page of an earlier run, which does not show the new pictures."""
         try:
             self.page.unlink(missing_ok=True)
         except OSError as error:
@@ -95,11 +96,11 @@ class ContactSheet:
             self._write(self._folder / folder / name, content)
 
     def finish(self, flight_name: str, cards: Sequence[Card]) -> None:
-        """Delete what is left of other runs, and write the page."""
+        """Delete pictures of earlier runs, and write the page."""
         for folder in (_PICTURES, _THUMBNAILS):
             for path in (self._folder / folder).iterdir():
                 if _OWN_NAME.fullmatch(path.name) and path.name not in self._kept:
-                    with suppress(OSError):  # it only takes room
+                    with suppress(OSError):  # a remaining picture does no harm
                         path.unlink()
         self._write(self.page, _render(flight_name, cards).encode("utf-8"))
 

@@ -1,4 +1,4 @@
-"""What all HTML pages share: templates, their filters, and pictures within the page."""
+"""Common parts of all HTML pages: templates, their filters, and embedded pictures."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def page_template(name: str) -> Template:
-    """Return a template of `kgcp/report/templates`, which fails if a value it names is missing."""
+    """Return a template of `kgcp/report/templates`; rendering fails if a value is missing."""
     from jinja2 import Environment, PackageLoader, StrictUndefined  # workers do not need it
 
     environment = Environment(

@@ -1,4 +1,4 @@
-"""A plan's figure, as PNG or SVG: byte for byte the same for the same plan."""
+"""The figure of a plan, as PNG or SVG, byte for byte the same for the same plan."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from kgcp.io.print.typeface import printable
 from kgcp.report.style import BLUE, GREY, VERMILION, sheet
 from kgcp.simulation.outlook import Outlook
 
-_WIDE = 50.0  # spans of deviations from which only powers of ten are numbered
-_LABEL_SHARE = 0.075  # of the axis, that a height's label takes
-_TITLE_LETTERS = 48  # of one line
+_WIDE_RATIO = 50.0  # of the deviations, above which only powers of ten are labelled
+_LABEL_SHARE = 0.075  # of the axis, taken by the label of a height
+_TITLE_LETTERS = 48  # per line
 _METADATA: dict[str, dict[str, str | None]] = {
     ".png": {"Software": None},
     ".svg": {"Date": None, "Creator": None},
@@ -78,7 +78,7 @@ def _draw_distance(axes: Axes, outlooks: Sequence[Outlook]) -> None:
         axes.legend(loc="upper left", fontsize=10)
     axes.set_yscale("log")
     axes.margins(y=0.15)
-    is_wide = bool(points) and points[-1][1] > _WIDE * points[0][1]
+    is_wide = bool(points) and points[-1][1] > _WIDE_RATIO * points[0][1]
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0,) if is_wide else (1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(_plain)
     axes.yaxis.set_minor_locator(NullLocator())
@@ -105,7 +105,7 @@ def _draw_found(axes: Axes, outlooks: Sequence[Outlook]) -> None:
 
 
 def _draw_ground(axes: Axes, outlooks: Sequence[Outlook]) -> None:
-    """Draw the image's width and height on the ground; numbers: frames of a pass."""
+    """Draw the image's width and height on the ground, with the number of frames per pass."""
     heights = [o.height_m for o in outlooks]
     for side, style, label in ((0, "o-", "image width"), (1, "s--", "image height")):
         axes.plot(heights, [o.footprint_m[side] for o in outlooks], style, color=BLUE, label=label)
@@ -144,7 +144,7 @@ def _number_heights(panels: Sequence[Axes], outlooks: Sequence[Outlook]) -> None
 
 
 def _is_free(heights: Sequence[float], index: int) -> bool:
-    """Whether the label of a height does not run into that of the one before."""
+    """Tell whether the label of a height does not overlap that of the one before."""
     span = math.log(heights[-1] / heights[0]) if len(heights) > 1 else 0.0
     before = heights[max(0, index - 1)]
     return index == 0 or math.log(heights[index] / before) > _LABEL_SHARE * span

@@ -7,10 +7,10 @@ from importlib import import_module
 
 
 def load_matplotlib() -> None:
-    """Import it without the settings of the current folder, before anything else imports it.
+    """Import matplotlib before anything else does, without the settings of the current folder.
 
-    It reads a file matplotlibrc there, and commands are mostly run in a flight's folder, which may
-    come from anybody.
+    It would read a file matplotlibrc there. Commands are mostly run in the folder of a flight,
+    which may come from anybody.
     """
     with chdir("/"):
         import_module("matplotlib")

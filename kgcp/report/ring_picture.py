@@ -1,4 +1,4 @@
-"""Pictures of one ring: as the frame shows it, with what was fitted to it, and what that leaves."""
+"""Pictures of one ring: in the frame, with the fitted contours, and the residuals of the fit."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.measurement.adjustment.residual_image import ResidualImage
 
 FULL_SCALE = 0.1
-"""Residuals, in shares of the contrast, that have the full colour."""
+"""Residuals with the full colour, as share of the contrast."""
 PICTURE_PX, THUMBNAIL_PX = 400, 160
-"""Width of either half of a picture, which is as high."""
+"""Width and height of each square of a picture."""
 CLOSEUP_PX = 320
 """Width and height of a close-up."""
 
-_REACH, _CLOSEUP_REACH = 1.4, 1.7  # of the outer radius, to each side
-_LEAST_REACH_PX = 6.0
-_QUALITY = 80
-_MAGNIFIED = 2.0  # from here on pixels are shown as squares
-_PARTS = 4  # bits of a pixel that lines are drawn to
-# Distinct to all kinds of colour vision, on ink and on plate; in OpenCV's order blue, green, red.
+_REACH, _CLOSEUP_REACH = 1.4, 1.7  # of a picture to each side, in outer radii
+_MIN_REACH_PX = 6.0
+_QUALITY = 80  # of JPEG
+_MIN_MAGNIFICATION = 2.0  # at which pixels are shown as squares
+_FRACTION_BITS = 4  # of the coordinates of lines
+# Colours that can be distinguished with all kinds of colour vision, on ink and on plate, in
+# OpenCV's order blue, green, red.
 _FITTED, _DROPPED, _CENTRE = (255, 170, 0), (0, 159, 230), (0, 94, 213)
 _DARKER, _BRIGHTER = np.array([178.0, 114.0, 0.0]), np.array([0.0, 94.0, 213.0])
 _NOTHING = (226, 226, 226)
@@ -41,7 +42,7 @@ class RingView:
 
     centre_px: FloatArray  # (2,): its centre in the raw frame [px]
     radius_px: float  # of its outer edge [px]
-    curves: Sequence[FloatArray]  # contours, fitted or of the outline that was dropped [px]
+    curves: Sequence[FloatArray]  # fitted contours, or the outline of a dropped ring [px]
     residual_image: ResidualImage | None = None  # residuals of the fit; None: there is no fit
     expected: Sequence[FloatArray] = ()  # dots that a dropped ring should have [px]
 
@@ -67,13 +68,13 @@ class _Cut:
 
     @classmethod
     def around(cls, view: RingView, reach: float) -> Self:
-        """Cut a square that reaches some radii to each side of the centre."""
-        reach_px = math.ceil(max(reach * view.radius_px, _LEAST_REACH_PX))
+        """Return the square that reaches `reach` radii to each side of the centre."""
+        reach_px = math.ceil(max(reach * view.radius_px, _MIN_REACH_PX))
         x, y = np.rint(view.centre_px).astype(int).tolist()
         return cls(x - reach_px, y - reach_px, 2 * reach_px + 1)
 
     def of(self, layer: npt.NDArray[np.generic], fill: float) -> FloatArray:
-        """Cut it out of a layer (height, width) of the frame; beyond that there is `fill`."""
+        """Cut the square out of a layer (height, width) of the frame, with `fill` outside it."""
         height, width = layer.shape
         cut = np.full((self.side, self.side), fill)
         top, left = max(self.y0, 0), max(self.x0, 0)
@@ -84,16 +85,16 @@ class _Cut:
         return cut
 
     def placed(self, points: FloatArray, size: int) -> FloatArray:
-        """Return points of the frame from the left and upper border of a picture of a size."""
+        """Return the frame's points in a picture of a size, from its left and upper border [px]."""
         corner = np.array([self.x0, self.y0]) - 0.5
         return np.asarray(size / self.side * (points - corner))
 
 
 def draw_ring(grey: GreyArray, view: RingView) -> Pictures:
-    """Draw the surroundings of a ring: with its contours, and beside it the residuals.
+    """Draw the surroundings of a ring with its contours, and the residuals beside it.
 
     The residuals are blue where the frame is brighter than the model, orange where it is darker,
-    and grey where there is no model. Where nothing was fitted, the ring is there without contours.
+    and grey where there is no model. If nothing was fitted, the ring is repeated without contours.
     """
     cut = _Cut.around(view, _REACH)
     plain = _stretched(cut.of(grey, math.nan))
@@ -109,7 +110,7 @@ def draw_ring(grey: GreyArray, view: RingView) -> Pictures:
 
 
 def draw_closeup(grey: GreyArray, view: RingView) -> tuple[bytes, tuple[FloatArray, ...]]:
-    """Draw the surroundings of a ring without lines; return the curves in the picture, too.
+    """Draw the surroundings of a ring without lines, and return the curves separately.
 
     Returns
     -------
@@ -125,7 +126,7 @@ def draw_closeup(grey: GreyArray, view: RingView) -> tuple[bytes, tuple[FloatArr
 
 
 def _stretched(cut: FloatArray) -> _Picture:
-    """Spread grey values from the darkest to the brightest; in colours, as all that follows."""
+    """Stretch grey values from the darkest to the brightest, and return them as three channels."""
     inside = np.isfinite(cut)
     low, high = (cut[inside].min(), cut[inside].max()) if inside.any() else (0.0, 1.0)
     level = np.nan_to_num(255.0 * (cut - low) / max(high - low, 1e-9), nan=0.0)
@@ -135,12 +136,12 @@ def _stretched(cut: FloatArray) -> _Picture:
 
 
 def _moved(residual_image: ResidualImage, cut: _Cut) -> _Cut:
-    """Return the same square in the residuals' own pixels."""
+    """Return the same square in pixels of the residual image."""
     return _Cut(cut.x0 - residual_image.x0, cut.y0 - residual_image.y0, cut.side)
 
 
 def _lit(white: FloatArray) -> _Picture:
-    """Return the level of white, from none to its largest, as grey; a plain tone off the plate."""
+    """Return the level of white as grey, from 0 to its largest; off the plate, a plain colour."""
     level = np.nan_to_num(255.0 * np.clip(white, 0.0, 1.0))
     picture = np.repeat(np.rint(level).astype(np.uint8)[:, :, None], 3, axis=2)
     picture[np.isnan(white)] = _OFF_PLATE
@@ -158,11 +159,11 @@ def _coloured(residual_image: ResidualImage, cut: _Cut) -> _Picture:
 
 def _sized(picture: _Picture, size: int) -> _Picture:
     """Scale a square to a size [px]."""
-    is_magnified = size >= _MAGNIFIED * len(picture)
-    way = cv2.INTER_NEAREST_EXACT if is_magnified else cv2.INTER_AREA
-    if len(picture) < size < _MAGNIFIED * len(picture):
-        way = cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(picture, (size, size), interpolation=way), dtype=np.uint8)
+    is_magnified = size >= _MIN_MAGNIFICATION * len(picture)
+    method = cv2.INTER_NEAREST_EXACT if is_magnified else cv2.INTER_AREA
+    if len(picture) < size < _MIN_MAGNIFICATION * len(picture):
+        method = cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(picture, (size, size), interpolation=method), dtype=np.uint8)
 
 
 def _with_contours(picture: _Picture, cut: _Cut, view: RingView) -> _Picture:
@@ -171,9 +172,11 @@ def _with_contours(picture: _Picture, cut: _Cut, view: RingView) -> _Picture:
     cross = [view.centre_px + np.array([-tip, tip]) for tip in (arm, arm[::-1])]
     for lines, ink in ((view.curves, colour), (view.expected, _FITTED), (cross, _CENTRE)):
         for line in lines:
-            points = np.rint((cut.placed(line, len(picture)) - 0.5) * 2**_PARTS).astype(np.int32)
+            points = np.rint((cut.placed(line, len(picture)) - 0.5) * 2**_FRACTION_BITS).astype(
+                np.int32
+            )
             cv2.polylines(picture, [points], isClosed=False, color=ink, thickness=1,
-                          lineType=cv2.LINE_AA, shift=_PARTS)  # fmt: skip
+                          lineType=cv2.LINE_AA, shift=_FRACTION_BITS)  # fmt: skip
     return picture
 
 

@@ -18,9 +18,9 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 MARK_STEPS = 10_000  # of a picture's width and height
 _DPI = 180
-_WIDTH_IN = 5.6  # letters of 12 pt have 10.5 px on a telephone of 390 px
-_FEW = 400  # points, up to which they are drawn large
-_FAR = 8.0  # robust standard deviations, beyond which points are drawn at the rim
+_WIDTH_IN = 5.6  # letters of 12 pt have 10.5 px on a telephone that is 390 px wide
+_MAX_LARGE = 400  # points that are drawn large; more are drawn small
+_MAX_DEVIATION = 8.0  # robust standard deviations; points farther off are drawn at the border
 _STYLE = {
     "font.size": 12.0,
     "font.family": "DejaVu Sans",
@@ -42,8 +42,8 @@ class Points:
     """Measurements drawn in one panel."""
 
     axes: Axes
-    rows: IndexArray  # (m,): which measurements, by their place in time
-    # (m,): where, in the panel's coordinates
+    rows: IndexArray  # (m,): numbers of the measurements, in the order of time
+    # (m,): in the panel's coordinates
     x: FloatArray
     y: FloatArray
 
@@ -53,8 +53,8 @@ class Picture:
     """A figure as a file, with the places of its points."""
 
     png: bytes
-    rows: IndexArray  # (m,): measurements that are drawn; one may be in several panels
-    # (m, 2): theirs, from the picture's left and top, in `MARK_STEPS` of its width and height
+    rows: IndexArray  # (m,): numbers of the drawn measurements; one may be in several panels
+    # (m, 2): their places from the picture's left and top, in 1/`MARK_STEPS` of width and height
     places: IndexArray
 
 
@@ -90,13 +90,13 @@ def scatter(
     marker: str = "o",
     among: FloatArray | None = None,
 ) -> Points:
-    """Draw measurements; those far off all others stand at the rim, as triangles.
+    """Draw measurements; those far from all others are drawn at the border, as triangles.
 
-    All others are these alone, or `among` (m,) if several kinds share a panel.
+    The others are those of `y`, or of `among` (m,) if several kinds share a panel.
     """
     low, high = _limits(y if among is None else among)
     shown = np.clip(y, low, high)
-    size = 4.0 if len(y) <= _FEW else 2.0
+    size = 4.0 if len(y) <= _MAX_LARGE else 2.0
     inside = shown == y
     axes.plot(x[inside], y[inside], marker, color=colour, markersize=size, alpha=0.7, label=label)
     for beyond, triangle in ((y > high, "^"), (y < low, "v")):
@@ -109,7 +109,7 @@ def _limits(values: FloatArray) -> tuple[float, float]:
     spread = float(np.median(np.abs(values - middle))) / 0.6745
     if spread == 0.0:
         return float(values.min()), float(values.max())
-    near = values[np.abs(values - middle) <= _FAR * spread]
+    near = values[np.abs(values - middle) <= _MAX_DEVIATION * spread]
     margin = 0.15 * float(np.ptp(near))
     low, high = float(values.min()), float(values.max())
     return max(low, near.min() - margin), min(high, near.max() + margin)

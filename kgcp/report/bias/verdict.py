@@ -1,4 +1,4 @@
-"""The verdict of the bias report: one word, the reasons for it, and what else is to be said."""
+"""The verdict of the bias report: the grade, the reasons for it, and further remarks."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class FlightGrade(IntEnum):
 class Limits:
     """Limits beyond which something is a finding."""
 
-    min_frames: int = 10  # compared: below there is no verdict "good"
+    min_frames: int = 10  # compared frames that the grade "good" requires
     unusable_rms_percent: float = 1.0  # of the errors; the paper has 1 % up to 100 m
     mean_percent: float = 0.02  # a mean error that neither noise nor the reference explains
     scale_percent: float = 0.02  # a significant scale
@@ -67,7 +67,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """All that is to be said, what matters most first."""
+    """All findings, the most serious first."""
 
     findings: tuple[Finding, ...]
 
@@ -83,7 +83,7 @@ class Verdict:
 
 
 def assess(numbers: BiasNumbers, reexposed: Sequence[Reexposed] = ()) -> Verdict:
-    """Judge a flight by its numbers, and by what measuring some frames again has changed."""
+    """Judge a flight by its numbers and by the distances of frames that were measured again."""
     findings = [
         _accuracy(numbers),
         _bias(numbers),
@@ -204,14 +204,14 @@ def _scatter(numbers: BiasNumbers) -> Iterator[Finding]:
         yield Finding(
             FlightGrade.LOOK,
             f"Residuals scatter {spread:.1f} times as much as their reported standard deviations"
-            " say: those of trajectory and reference poses may be too small.",
+            " predict: those of trajectory and reference poses may be too small.",
             "standardised",
         )
     elif spread < LIMITS.standardised_low:
         yield Finding(
             FlightGrade.GOOD,
             f"Residuals scatter only {spread:.2f} times as much as their reported standard"
-            " deviations say: those of trajectory and reference poses may be too large.",
+            " deviations predict: those of trajectory and reference poses may be too large.",
             "standardised",
         )
 

@@ -15,7 +15,7 @@ LABELS = {
     "edge_curvature_px2": "curved edges",
 } | {quantity.name: quantity.label for quantity in QUANTITIES}
 """Names of the regression's terms in print."""
-_NOT_AGREED = "Single measurements do not agree on what the curve is near to: each keeps its own."
+_NOT_AGREED = "Measurements do not agree on which known curve theirs is near: each keeps its own."
 _PER = {quantity.name: quantity.per for quantity in QUANTITIES}
 
 
@@ -38,7 +38,7 @@ def value_of(term: Term) -> str:
 
 
 def reference_allows(term: Term, numbers: BiasNumbers) -> str | None:
-    """Return what errors of the reference distances may feign of a term; None: not known."""
+    """Return how large a term errors of the reference distances can cause; None: not known."""
     if term.name == "scale" and numbers.total.sd_reference_percent is not None:
         return f"± {rounded(numbers.total.sd_reference_percent)} %"
     if term.name == "offset_m" and numbers.sd_reference_m is not None:
@@ -94,7 +94,7 @@ def probability_text(probability: float) -> str:
 
 
 def exposure_sentence(regression: Regression) -> str:
-    """Return what exposure has to do with the residuals."""
+    """Return the sentence on the effect of exposure on the residuals."""
     if regression.exposure_probability is None:
         return "No exposure quantity varies enough in this flight to be examined."
     share = f"{100.0 * regression.exposure_share:.0f} % of the variance that scale and offset leave"
@@ -105,7 +105,7 @@ def exposure_sentence(regression: Regression) -> str:
 
 
 def learnt_sentence(learnt: LearntImaging) -> str:
-    """Say what was learnt, and how much it has changed."""
+    """Return the sentences on what was learnt about the camera."""
     low, middle, high = learnt.sharpening.tolist()
     about = _NOT_AGREED if learnt.base is None else _about_tone(learnt, learnt.base)
     smoothing = learnt.smoothing
@@ -117,7 +117,7 @@ def learnt_sentence(learnt: LearntImaging) -> str:
 
 
 def _about_tone(learnt: LearntImaging, base: ToneBase) -> str:
-    """Say from how many measurements a tone curve was learnt, and which of them disagree."""
+    """Return how many measurements a tone curve was learnt from, and how many of them disagree."""
     count = counted(learnt.measurements, "measurement")
     parts = [f"The tone curve departs from {base.value}, learnt from {count}"]
     if learnt.overruled:
