@@ -27,16 +27,16 @@ from kgcp.report.style import MARK_STEPS, Picture
 
 _TITLES = {
     "error": "error against distance",
-    "causes": "what the error is made of",
+    "causes": "causes of the error",
     "rate": "detection rate",
     "exposure": "error against exposure",
     "edges": "one edge against two",
     "reexposure": "measured again",
     "standardised": "errors over their standard deviations",
     "worst": "largest residuals",
-    "left-out": "what is left out",
+    "left-out": "excluded frames",
 }
-"""Of the sections that findings lead to, by their ids."""
+"""Texts of the links from findings to sections, by the ids of the sections."""
 _DIGITS = 7  # significant, of the values in the page; bias.parquet has all
 
 
@@ -46,20 +46,20 @@ class Content:
 
     name: str  # of the flight
     headline: str  # program, day, camera, target, CRS
-    facts: Sequence[Fact]  # what the report was made from
+    facts: Sequence[Fact]  # inputs and settings
     agreement: str  # of vehicle and camera, in a sentence
-    advice: Sequence[str]  # what to change in flight.toml
-    doubts: Sequence[Doubt]  # what else does not fit
+    advice: Sequence[str]  # changes of flight.toml
+    doubts: Sequence[Doubt]  # other contradictions between the inputs
     numbers: BiasNumbers
     verdict: Verdict
-    learnt: str  # of the camera, in sentences; empty: nothing
-    # by the name of the figure; one that is missing is left out of the page
+    learnt: str  # sentences on the camera, estimated from the frames; may be empty
+    # by the name of the figure; the page omits missing ones
     pictures: Mapping[str, Picture]
-    rows: Sequence[Mapping[str, object]]  # of `bias.parquet`, for the measurements in time
-    # by the measurement's place in time, as `draw_closeup` returns them
+    rows: Sequence[Mapping[str, object]]  # of `bias.parquet`, one per measurement, in time
+    # as `draw_closeup` returns them, by the row of the measurement
     closeups: Mapping[int, tuple[bytes, tuple[FloatArray, ...]]]
     reexposed: Sequence[Reexposed]
-    summary: Json  # what `bias_summary.json` holds
+    summary: Json  # contents of `bias_summary.json`
 
 
 def render_page(content: Content) -> str:
@@ -68,7 +68,7 @@ def render_page(content: Content) -> str:
         content=content,
         numbers=content.numbers,
         verdict=content.verdict,
-        images=embedded_pictures({name: each.png for name, each in content.pictures.items()}),
+        images=embedded_pictures({name: figure.png for name, figure in content.pictures.items()}),
         data=_embedded(_data(content)),
         limits=LIMITS,
         words=wording,
@@ -79,17 +79,19 @@ def render_page(content: Content) -> str:
 def _embedded(data: Json) -> Markup:
     """Return JSON that is safe in a script element, whatever names it contains."""
     text = json.dumps(finite(data), allow_nan=False, separators=(",", ":"))
-    # ASCII already; without these three no text can end the element or begin a comment
+    # already ASCII; without these three characters, no text can end the element or begin a comment
     for character in "<>&":
         text = text.replace(character, f"\\u{ord(character):04x}")
-    return Markup(text)  # noqa: S704  nothing in it is markup any more
+    return Markup(text)  # noqa: S704  it contains no markup any more
 
 
 def _data(content: Content) -> Json:
     names = [column.name for column in BIAS_COLUMNS]
     return {
         "columns": {name: [_cell(row[name]) for row in content.rows] for name in names},
-        "residuals": [_cell(each) for each in content.numbers.standardised_residuals.tolist()],
+        "residuals": [
+            _cell(residual) for residual in content.numbers.standardised_residuals.tolist()
+        ],
         "labels": {quantity.name: quantity.label for quantity in QUANTITIES},
         "steps": MARK_STEPS,
         "pictures": {

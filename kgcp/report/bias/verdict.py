@@ -14,9 +14,9 @@ from kgcp.report.bias.numbers import BiasNumbers, RangeRow
 from kgcp.report.bias.reexposure import GAINS, Reexposed
 from kgcp.report.bias.wording import (
     LABELS,
+    effect_of_reference,
     exposure_sentence,
     meaning_of,
-    reference_allows,
     signed_amount,
     value_of,
 )
@@ -31,20 +31,20 @@ class FlightGrade(IntEnum):
 
     @property
     def words(self) -> str:
-        """The grade in print."""
-        return ("Good", "Look at what is marked below", "Not usable as it is")[self]
+        """The grade, as the report prints it."""
+        return ("Good", "Check the findings below", "Not usable as it is")[self]
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits beyond which something is a finding."""
+    """Limits of the grades."""
 
     min_frames: int = 10  # compared frames that the grade "good" requires
     unusable_rms_percent: float = 1.0  # of the errors; the paper has 1 % up to 100 m
-    mean_percent: float = 0.02  # a mean error that neither noise nor the reference explains
-    scale_percent: float = 0.02  # a significant scale
-    offset_m: float = 0.01  # a significant offset
-    exposure_share: float = 0.1  # of the variance, explained by exposure with a significant term
+    mean_percent: float = 0.02  # of a mean error that neither noise nor the reference explains
+    scale_percent: float = 0.02  # of a significant scale
+    offset_m: float = 0.01  # of a significant offset
+    exposure_share: float = 0.1  # of the variance that exposure explains, if a term is significant
     reexposure_percent: float = 0.1  # RMS change of distances measured again, darker and brighter
     standardised_low: float = 0.5  # scatter of the fit's residuals over their reported sds
     standardised_high: float = 1.5
@@ -60,9 +60,9 @@ LIMITS = Limits()
 class Finding:
     """One sentence of the verdict."""
 
-    grade: FlightGrade  # grade that it gives the flight; `GOOD` if it only informs
+    grade: FlightGrade  # that the flight gets; `GOOD`: the sentence only informs
     text: str
-    section: str  # where the page shows it: the id of a section
+    section: str  # id of the section of the page that shows the numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ def assess(numbers: BiasNumbers, reexposed: Sequence[Reexposed] = ()) -> Verdict
         _bias(numbers),
         *_causes(numbers),
         *_scatter(numbers),
-        *_losses(numbers),
+        *_exclusions(numbers),
         *_reexposure(reexposed),
         *_detection(numbers),
         *_reservations(numbers),
@@ -99,19 +99,18 @@ def assess(numbers: BiasNumbers, reexposed: Sequence[Reexposed] = ()) -> Verdict
 
 def _accuracy(numbers: BiasNumbers) -> Finding:
     count = numbers.total.percent.count
-    parts = [f"{_rms(row)} {row.label} ({row.percent.count})" for row in numbers.halves]
+    parts = [f"{_rms(row)} {row.label} ({row.percent.count} of them)" for row in numbers.halves]
     text = f"Distance error (RMS) over {counted(count, 'frame')}: {'; '.join(parts)}."
     if numbers.total.percent.rms > LIMITS.unusable_rms_percent:
         return Finding(
             FlightGrade.UNUSABLE,
-            f"{text} That is above {LIMITS.unusable_rms_percent:g} %: something is wrong with"
-            " target, camera, times, reference or exposure.",
+            f"{text} Over all distances it is above {LIMITS.unusable_rms_percent:g} %: something is"
+            " wrong with target, camera, times, reference or exposure.",
             "error",
         )
     if count < LIMITS.min_frames:
-        return Finding(
-            FlightGrade.LOOK, f"{text} Fewer than {LIMITS.min_frames} frames say little.", "error"
-        )
+        needed = f"The grade 'good' requires at least {LIMITS.min_frames} frames."
+        return Finding(FlightGrade.LOOK, f"{text} {needed}", "error")
     return Finding(FlightGrade.GOOD, text, "error")
 
 
@@ -121,47 +120,47 @@ def _rms(row: RangeRow) -> str:
 
 def _bias(numbers: BiasNumbers) -> Finding:
     if numbers.total.percent.count == 1:
-        return Finding(FlightGrade.LOOK, "One frame says nothing about bias.", "error")
+        return Finding(FlightGrade.LOOK, "One frame is not enough to determine a bias.", "error")
     if not numbers.biased:
         is_stated = numbers.total.sd_reference_percent is not None
-        beyond = "noise and the reference's own errors" if is_stated else "noise"
+        beyond = "noise and errors of the reference" if is_stated else "noise"
         text = f"No bias beyond {beyond}: the mean error is {_mean(numbers.total)}."
         return Finding(FlightGrade.GOOD, text, "error")
     sides = [(row, "long" if row.percent.mean > 0.0 else "short") for row in numbers.biased]
     parts = [f"too {side} {row.label}, on average by {_mean(row)}" for row, side in sides]
     material = any(abs(row.percent.mean) >= LIMITS.mean_percent for row in numbers.biased)
-    text = f"Biased: distances are measured {'; '.join(parts)}."
+    text = f"Biased: measured distances are {'; '.join(parts)}."
     return Finding(FlightGrade.LOOK if material else FlightGrade.GOOD, text, "error")
 
 
 def _mean(row: RangeRow) -> str:
-    """Return a mean error with its noise and the possible error of the reference."""
+    """Return a mean error with its noise and the error that the reference can cause."""
     text = signed_amount(row.percent.mean, row.percent.sd_mean, "%")
     if row.sd_reference_percent is None:
         return text
-    return f"{text} (the reference allows ± {rounded(row.sd_reference_percent)} %)"
+    return f"{text} (the reference can cause ± {rounded(row.sd_reference_percent)} %)"
 
 
 def _causes(numbers: BiasNumbers) -> Iterator[Finding]:
     regression = numbers.regression
     if regression is None:
-        text = "Scale and offset cannot be told apart: too few frames, or distances too alike."
+        text = "Scale and offset cannot be separated: too few frames, or distances too similar."
         yield Finding(FlightGrade.LOOK, text, "causes")
         return
     basic = [term for term in regression.terms if term.name in {"scale", "offset_m"}]
     if not any(term.is_significant for term in basic):
         values = " and ".join(
-            f"{LABELS[term.name]} {value_of(term)}{_allowed(term, numbers)}" for term in basic
+            f"{LABELS[term.name]} {value_of(term)}{_possible(term, numbers)}" for term in basic
         )
-        yield Finding(FlightGrade.GOOD, f"Neither is significant: {values}.", "causes")
+        yield Finding(FlightGrade.GOOD, f"Not significant: {values}.", "causes")
     large = {"scale": 0.01 * LIMITS.scale_percent, "offset_m": LIMITS.offset_m}
     for term in regression.terms:
         if term.name in large and term.is_significant:
             material = abs(term.value) >= large[term.name]
             text = meaning_of(term)
-            allowed = reference_allows(term, numbers)
-            if allowed is not None:
-                text += f" Errors of the reference allow {allowed}."
+            possible = effect_of_reference(term, numbers)
+            if possible is not None:
+                text += f" Errors of the reference can cause {possible}."
             yield Finding(FlightGrade.LOOK if material else FlightGrade.GOOD, text, "causes")
         elif term.name == "edge_curvature_px2":
             yield Finding(FlightGrade.LOOK, meaning_of(term), "causes")
@@ -175,9 +174,9 @@ def _causes(numbers: BiasNumbers) -> Iterator[Finding]:
     )
 
 
-def _allowed(term: Term, numbers: BiasNumbers) -> str:
-    allowed = reference_allows(term, numbers)
-    return "" if allowed is None else f" (the reference allows {allowed})"
+def _possible(term: Term, numbers: BiasNumbers) -> str:
+    possible = effect_of_reference(term, numbers)
+    return "" if possible is None else f" (the reference can cause {possible})"
 
 
 def _reexposure(reexposed: Sequence[Reexposed]) -> Iterator[Finding]:
@@ -185,17 +184,17 @@ def _reexposure(reexposed: Sequence[Reexposed]) -> Iterator[Finding]:
     if not changes:
         return
     rms = math.hypot(*changes) / math.sqrt(len(changes))
-    lost = len(reexposed) - len(changes)
+    failed = len(reexposed) - len(changes)
     text = (
-        f"Measured again with grey values × {' and × '.join(f'{gain:g}' for gain in GAINS)},"
-        f" distances change by {rms:.3f} % (RMS of {len(changes)}; {lost} lost)."
+        f"If grey values are multiplied by {' and by '.join(f'{gain:g}' for gain in GAINS)},"
+        f" distances change by {rms:.3f} % (RMS of {len(changes)}; not measured: {failed})."
     )
     grade = FlightGrade.LOOK if rms > LIMITS.reexposure_percent else FlightGrade.GOOD
     yield Finding(grade, text, "reexposure")
 
 
 def _scatter(numbers: BiasNumbers) -> Iterator[Finding]:
-    """Compare the scatter of errors, without scale and offset, with their reported deviations."""
+    """Compare the scatter of the residuals with their reported standard deviations."""
     regression = numbers.regression
     if regression is None or numbers.standardised is None or numbers.sd_reference_m is None:
         return
@@ -204,19 +203,20 @@ def _scatter(numbers: BiasNumbers) -> Iterator[Finding]:
         yield Finding(
             FlightGrade.LOOK,
             f"Residuals scatter {spread:.1f} times as much as their reported standard deviations"
-            " predict: those of trajectory and reference poses may be too small.",
+            " predict: the standard deviations of trajectory and reference poses may be too small.",
             "standardised",
         )
     elif spread < LIMITS.standardised_low:
         yield Finding(
             FlightGrade.GOOD,
             f"Residuals scatter only {spread:.2f} times as much as their reported standard"
-            " deviations predict: those of trajectory and reference poses may be too large.",
+            " deviations predict: the standard deviations of trajectory and reference poses may be"
+            " too large.",
             "standardised",
         )
 
 
-def _losses(numbers: BiasNumbers) -> Iterator[Finding]:
+def _exclusions(numbers: BiasNumbers) -> Iterator[Finding]:
     regression = numbers.regression
     outliers = 0 if regression is None else int(regression.outlier.sum())
     misplaced = len(numbers.misplaced)
@@ -231,15 +231,15 @@ def _losses(numbers: BiasNumbers) -> Iterator[Finding]:
     parts = []
     if misplaced:
         parts.append(
-            f"{counted(misplaced, 'measurement')} not where the target must be,"
-            " left out of the statistics"
+            f"Excluded from the statistics: {counted(misplaced, 'measurement')} away from"
+            " the target's expected position"
         )
     if outliers:
         parts.append(
-            f"{counted(outliers, 'outlier')}, more than five standard"
-            " deviations off the regression and left out of it"
+            f"Excluded from the regression: {counted(outliers, 'outlier')}, more than five"
+            " standard deviations from it"
         )
-    yield Finding(grade, f"{'; '.join(parts)}.", "worst")
+    yield Finding(grade, f"{'. '.join(parts)}.", "worst")
 
 
 def _detection(numbers: BiasNumbers) -> Iterator[Finding]:
@@ -271,7 +271,7 @@ def _reservations(numbers: BiasNumbers) -> Iterator[Finding]:
     if not numbers.attitudes_agree:
         yield Finding(
             FlightGrade.LOOK,
-            "The reference attitudes do not lead to the measured points: check omega, phi, kappa;"
-            " distances do not depend on them.",
+            "The reference attitudes do not agree with the measured points: check omega, phi,"
+            " kappa. Distances do not depend on them.",
             "left-out",
         )

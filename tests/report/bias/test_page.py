@@ -161,7 +161,7 @@ def test_every_figure_is_drawn_and_nothing_is_wider_than_the_window(page: Page) 
     images = page.query_selector_all(".plot img")
     assert len(images) == len(FIGURE_FILES)
     assert all(0.01 < page.evaluate(INK, image) < 0.6 for image in images)
-    assert page.locator(".verdict h2").inner_text() == "Look at what is marked below"
+    assert page.locator(".verdict h2").inner_text() == "Check the findings below"
     assert page.locator("#gallery button").count() == 20
     assert all(page.evaluate(INK, image) > 0.1 for image in page.query_selector_all("#gallery img"))
 
@@ -255,7 +255,7 @@ def test_tables_and_numbers_can_be_saved(page: Page, made: Made) -> None:
     summary = json.loads((made.folder / "bias_summary.json").read_text(encoding="utf-8"))
     assert json.loads(saved(page, "bias_summary.json")) == summary
     causes = list(csv.reader(io.StringIO(saved(page, "causes.csv"), newline="")))
-    assert causes[0] == ["Cause", "Estimate ± sd", "Reference allows", "p", "In words"]
+    assert causes[0] == ["Cause", "Estimate ± sd", "From the reference", "p", "In words"]
     for name, unit in (("distance", "m"), ("radius", "px")):
         rates = list(csv.reader(io.StringIO(saved(page, f"rates_by_{name}.csv"), newline="")))
         assert rates[0][0] == name.capitalize()
@@ -279,7 +279,7 @@ def test_exactly_the_numbers_that_exist_are_documented(made: Made) -> None:
 def test_without_frames_there_is_a_page_too(compare: Compare, study: Study, tmp_path: Path) -> None:
     report = of_sample(study(compare(30.0, 0.1))).write_report(tmp_path, reexpose=5)
     text = (tmp_path / "bias_report.html").read_text(encoding="utf-8")
-    assert "One frame says nothing about bias." in text
+    assert "One frame is not enough to determine a bias." in text
     assert "The frames are not where" in text or "the frames are not where" in text
     assert {path.name for path in report.files} >= {"bias_error.png", "bias_summary.json"}
     assert not (tmp_path / "bias_reexposure.png").exists()
