@@ -149,7 +149,13 @@ def test_exactly_the_numbers_that_exist_are_documented(calibration: tuple[Path, 
 def test_the_page_is_self_contained_and_complete(calibration: tuple[Path, Result]) -> None:
     page = (calibration[0] / "calibration.html").read_text(encoding="utf-8")
     assert "http" not in page.replace("http://www.w3.org", "")
-    for name in ("The camera", "How well it fits", "Eccentricity", "photo11.png", "decode_failed"):
+    for name in (
+        "The camera",
+        "Shape of the field",
+        "Eccentricity",
+        "photo11.png",
+        "decode_failed",
+    ):
         assert name in page
 
 

@@ -17,12 +17,12 @@ from kgcp.quality.eccentricity import displacement_over_frame, eccentricity_over
 from kgcp.quality.frame_rays import CameraDifference
 from kgcp.report.style import BLUE, GREEN, GREY, VERMILION, Picture, picture, sheet
 
-_ARROW_SHARE = 0.04  # of the frame's width, that a typical residual is drawn long
-_LONGEST_SHARE = 0.07  # of the frame's width, that the longest displacement is drawn long
-_NOTHING_PX = 1e-6
+_ARROW_SHARE = 0.04  # length of the arrow of a median residual, of the frame's width
+_MAX_ARROW_SHARE = 0.07  # length of the longest arrow of displacement, of the frame's width
+_MIN_DRAWN_PX = 1e-6  # smaller displacements have no arrows
 _COLOURS = (BLUE, VERMILION, GREEN)
-_RADII = 60
-_SHAPE_IN = 5.0  # width of a frame or field in a figure
+_RADII = 60  # points of the curve of distortion
+_PANEL_WIDTH_IN = 5.0  # width of a frame or field in a figure
 _MM = 1e3
 
 
@@ -44,15 +44,15 @@ def draw_figures(calibration: CameraCalibration, numbers: CalibrationNumbers) ->
 
 
 def draw_comparison(camera: Camera, difference: CameraDifference) -> bytes:
-    """Return how another calibration moves the rays of a camera over the frame, as PNG."""
-    is_there = np.isfinite(difference.shifts_px).all(axis=1)
-    shifts = difference.shifts_px[is_there]
+    """Draw how the rays of another calibration differ over the frame; return a PNG."""
+    is_known = np.isfinite(difference.shifts_px).all(axis=1)
+    shifts = difference.shifts_px[is_known]
     length = 2.0 * _ARROW_SHARE * camera.width
     largest = max(difference.largest_px, 1e-9)
     with sheet(_height_in(camera.width, camera.height)) as figure:
         axes = figure.subplots()
         _frame(axes, camera.width, camera.height)
-        _arrows(axes, difference.pixels[is_there], shifts, largest / length, BLUE)
+        _arrows(axes, difference.pixels[is_known], shifts, largest / length, BLUE)
         axes.set_xlabel(f"x [px]   (the longest arrow is {largest:.3f} px)")
         axes.set_ylabel("y [px]")
         return picture(figure).png
@@ -63,15 +63,17 @@ def _residuals(calibration: CameraCalibration) -> Picture:
     used = solution.is_used
     places = np.concatenate([view.vectors[:, :2] for view in calibration.views])
     residuals = solution.residuals
-    typical = float(np.median(np.linalg.norm(residuals[used], axis=1)))
-    scale = max(typical, 1e-9) / (_ARROW_SHARE * camera.width)
+    median_px = float(np.median(np.linalg.norm(residuals[used], axis=1)))
+    scale = max(median_px, 1e-9) / (_ARROW_SHARE * camera.width)
     with sheet(_height_in(camera.width, camera.height)) as figure:
         axes = figure.subplots()
         _frame(axes, camera.width, camera.height)
         _arrows(axes, places[used], residuals[used], scale, BLUE)
         axes.plot(*places[~used].T, "x", color=VERMILION, markersize=5.0, label="rejected")
         length = _ARROW_SHARE * camera.width
-        axes.set_xlabel(f"x [px]   (an arrow of {length:.0f} px is a residual of {typical:.3f} px)")
+        axes.set_xlabel(
+            f"x [px]   (an arrow of {length:.0f} px is a residual of {median_px:.3f} px)"
+        )
         axes.set_ylabel("y [px]")
         if not used.all():
             axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))
@@ -88,7 +90,7 @@ def _photographs(calibration: CameraCalibration) -> Picture:
     with sheet(3.6) as figure:
         axes = figure.subplots()
         axes.bar(np.arange(1, count + 1), rms, color=BLUE)
-        axes.axhline(calibration.operator_sd_px, color=VERMILION, label="stated by the operator")
+        axes.axhline(calibration.operator_sd_px, color=VERMILION, label="expected from the discs")
         axes.set_xlabel("photograph, in the order of the table")
         axes.set_ylabel("RMS per point [px]")
         axes.legend()
@@ -139,7 +141,7 @@ def _distortion(calibration: CameraCalibration) -> Picture:
 
 
 def _field(calibration: CameraCalibration) -> Picture:
-    """Draw how the field differs from what it is meant to be, in its plane and in height."""
+    """Draw the differences of the field from its nominal shape, in its plane and in height."""
     nominal = calibration.field.points_m()
     change = _MM * (calibration.solution.estimate.points - nominal)
     side = side_of_cameras(calibration.solution.estimate)
@@ -178,12 +180,12 @@ def side_of_cameras(estimate: Estimate) -> float:
 
 
 def draw_eccentricity(camera: Camera, radii_px: Sequence[float]) -> Picture:
-    """Draw eccentricity by perspective over the angle, and distortion in the marker over the frame.
+    """Draw eccentricity by perspective over the angle, and by distortion over the frame.
 
     Parameters
     ----------
     radii_px : sequence of float
-        Of discs' images, at most three; the last one for the frame.
+        Of the images of at most three discs; the last one is drawn over the frame.
     """
     with sheet(7.6) as figure:
         above, below = figure.subplots(2, 1, height_ratios=(1.0, 1.3))
@@ -201,8 +203,8 @@ def draw_eccentricity(camera: Camera, radii_px: Sequence[float]) -> Picture:
 def _draw_displacement(axes: Axes, camera: Camera, radius_px: float) -> None:
     places, shifts = displacement_over_frame(camera, radius_px)
     largest = float(np.linalg.norm(shifts, axis=1).max())
-    scale = largest / (_LONGEST_SHARE * camera.width)
-    if largest > _NOTHING_PX:
+    scale = largest / (_MAX_ARROW_SHARE * camera.width)
+    if largest > _MIN_DRAWN_PX:
         _arrows(axes, places, shifts, scale, BLUE, width=0.004)
     axes.plot(*places.T, ".", color=GREY, markersize=3.0)
     _frame(axes, camera.width, camera.height)
@@ -234,13 +236,13 @@ def _arrows(
 
 
 def _beside(axes: Axes) -> Axes:
-    """Return room for the scale of the colours, as high as the picture."""
+    """Return axes for the colour bar, as high as the panel."""
     return axes.inset_axes((1.04, 0.0, 0.05, 1.0))
 
 
 def _height_in(width: float, height: float) -> float:
-    """Return the height of a figure of something with this shape [in]."""
-    return float(np.clip(1.0 + _SHAPE_IN * height / width, 2.5, 9.0))
+    """Return the height of a figure for a panel with this aspect ratio [in]."""
+    return float(np.clip(1.0 + _PANEL_WIDTH_IN * height / width, 2.5, 9.0))
 
 
 def _frame(axes: Axes, width: int, height: int) -> None:
@@ -250,6 +252,6 @@ def _frame(axes: Axes, width: int, height: int) -> None:
 
 
 def ellipse_sizes(vectors: FloatArray) -> FloatArray:
-    """Return the mean radii (k,) of discs by their moments [px]."""
+    """Return the mean radii (k,) of discs from their moments [px]."""
     determinant = vectors[:, 2] * vectors[:, 4] - vectors[:, 3] ** 2
     return np.asarray(2.0 * determinant**0.25)

@@ -22,19 +22,19 @@ from kgcp.quality.frame_rays import CameraDifference
 from kgcp.quality.number_text import minus
 from kgcp.report.html_page import embedded_pictures, page_template
 
-_PIXELS = 4  # the first parameters are lengths in pixels
+_PIXEL_PARAMETERS = 4  # the first ones are lengths in pixels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraComparison:
-    """The camera beside that of another calibration."""
+    """The camera compared with that of another calibration."""
 
     name: str
     camera: Camera
     difference: CameraDifference
 
     def numbers(self, camera: Camera) -> dict[str, object]:
-        """Return what calibration.json says of it; changes are this camera's minus the other's."""
+        """Return the entry of calibration.json; changes are `camera` minus the other camera."""
         changes = {
             name: getattr(camera, name) - getattr(self.camera, name)
             for name in CALIBRATION_PARAMETERS
@@ -58,7 +58,7 @@ class CalibrationPage:
 
 @dataclass(frozen=True, slots=True)
 class ParameterRow:
-    """A line of the camera's table, in words."""
+    """A row of the camera's table, as text."""
 
     name: str
     value: str
@@ -86,21 +86,21 @@ def render_calibration(page: CalibrationPage) -> str:
 
 
 def parameter_rows(calibration: CameraCalibration) -> list[ParameterRow]:
-    """Return name, value, deviation and remarks of every parameter that is not zero."""
+    """Return a row for every parameter that is not zero or was estimated."""
     sd = np.sqrt(calibration.covariance.cov.diagonal())
     rows = []
     for index, name in enumerate(CALIBRATION_PARAMETERS):
         value = float(getattr(calibration.camera, name))
         if value == 0.0 and sd[index] == 0.0:
             continue
-        digits = 3 if index < _PIXELS else 6
+        digits = 3 if index < _PIXEL_PARAMETERS else 6
         notes = []
         if name in calibration.undetermined:
             notes.append("not determined")
         if name in calibration.tangled:
             others = [other for other in calibration.tangled if other != name]
-            notes.append(f"not told apart from {', '.join(others)}")
-        unit = " px" if index < _PIXELS else ""
+            notes.append(f"cannot be separated from {', '.join(others)}")
+        unit = " px" if index < _PIXEL_PARAMETERS else ""
         rows.append(
             ParameterRow(
                 name,
@@ -113,31 +113,31 @@ def parameter_rows(calibration: CameraCalibration) -> list[ParameterRow]:
 
 
 def fit_words(calibration: CameraCalibration) -> str:
-    """Return how well discs fit and whether all parameters are known, in words."""
+    """Return one sentence on the residuals and on parameters that are not determined."""
     weak = (
         (calibration.undetermined, "not determined by these photographs"),
-        (calibration.tangled, "not told apart"),
+        (calibration.tangled, "cannot be separated"),
     )
-    remarks = [f"{', '.join(names)} {said}" for names, said in weak if names]
-    known = "; ".join(remarks) or "all parameters are determined"
+    remarks = [f"{', '.join(names)} {remark}" for names, remark in weak if names]
+    determined = "; ".join(remarks) or "all parameters are determined"
     return (
-        f"Discs fit to {calibration.rms_px:.3f} px and are measured to"
-        f" {calibration.operator_sd_px:.3f} px; {known}."
+        f"The RMS of the residuals is {calibration.rms_px:.3f} px, the standard deviation of a"
+        f" measured disc {calibration.operator_sd_px:.3f} px; {determined}."
     )
 
 
 def datum_words(calibration: CameraCalibration) -> str:
-    """Return what gives the field its place and scale, in words."""
+    """Return the sentences on the datum of the field: shift, rotation and scale."""
     has_bars = bool(calibration.field.bars)
-    sentences = ["The scale is that of the bars."] if has_bars else []
+    sentences = ["The scale comes from the bars."] if has_bars else []
     if calibration.points_used is PointModel.FREE:
-        datum = "Shift and turn" if has_bars else "Shift, turn and scale"
+        datum = "Shift and rotation" if has_bars else "Shift, rotation and scale"
         sentences.append(f"{datum} are those of the nominal field.")
     return " ".join(sentences)
 
 
 def neglected_words(calibration: CameraCalibration) -> str:
-    """Return how wrong the camera would be without the eccentricities, in words."""
+    """Return the error of the camera if eccentricities are neglected, as text."""
     change = change_if_neglected(calibration)
     focal = change["fx"] / calibration.camera.fx
     fx, share, cx, cy = (
@@ -155,18 +155,18 @@ def neglected_words(calibration: CameraCalibration) -> str:
 def _correlations(calibration: CameraCalibration) -> tuple[list[str], list[list[str]]]:
     """Return names and the lower triangle of the correlations, as text."""
     cov = calibration.covariance.cov
-    known = [index for index in range(len(cov)) if cov[index, index] > 0.0]
-    sd = np.sqrt(cov.diagonal()[known])
-    correlation = cov[np.ix_(known, known)] / np.outer(sd, sd)
+    estimated = [index for index in range(len(cov)) if cov[index, index] > 0.0]
+    sd = np.sqrt(cov.diagonal()[estimated])
+    correlation = cov[np.ix_(estimated, estimated)] / np.outer(sd, sd)
     texts = [
         [minus(f"{correlation[row, column]:.2f}") for column in range(row + 1)]
-        for row in range(len(known))
+        for row in range(len(estimated))
     ]
-    return [CALIBRATION_PARAMETERS[index] for index in known], texts
+    return [CALIBRATION_PARAMETERS[index] for index in estimated], texts
 
 
 def _eccentricity(calibration: CameraCalibration) -> EccentricitySummary:
-    """Return how large and tilted discs are, and how far their centroids are from their centres."""
+    """Return sizes, tilts and eccentricities of the imaged discs."""
     circles = observed_circles(
         calibration.field, calibration.solution.estimate, calibration.network.observations
     )

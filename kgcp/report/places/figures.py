@@ -13,11 +13,11 @@ from kgcp.network.ground.target_places import PlacedTarget
 from kgcp.report.style import BLUE, GREEN, GREY, VERMILION, Picture, picture, sheet
 
 _COLOURS = {"x": BLUE, "y": VERMILION, "z": GREEN}
-_EXPECTED_CHI2 = 5.0  # five numbers of a frame
+_EXPECTED_CHI2 = 5.0  # of the five numbers of a frame
 _MM = 1e3
-_NAME_LETTERS = 16  # of a name; the page's tables have all
-_LINE_LETTERS = 26  # of names side by side
-_MOST_NAMES = 25  # upright ones
+_MAX_NAME_LETTERS = 16  # longer names are cut; the page's tables have them in full
+_MAX_LINE_LETTERS = 26  # of horizontal names; more letters are written upright
+_MAX_NAMES = 25  # that fit side by side upright
 
 
 def draw_places(placed: tuple[PlacedTarget, ...]) -> dict[str, bytes]:
@@ -31,7 +31,7 @@ def draw_places(placed: tuple[PlacedTarget, ...]) -> dict[str, bytes]:
 def _diameters(placed: tuple[PlacedTarget, ...]) -> Picture:
     """Draw the diameters' residuals with two standard deviations."""
     places = np.arange(len(placed))
-    off = [target.check.diameter_permille for target in placed]
+    differences = [target.check.diameter_permille for target in placed]
     sd = [
         1e3 * target.check.sd_diameter_residual_m / target.check.stated_diameter_m
         for target in placed
@@ -39,42 +39,46 @@ def _diameters(placed: tuple[PlacedTarget, ...]) -> Picture:
     with sheet(3.4) as figure:
         axes = figure.subplots()
         axes.axhline(0.0, color="black", linewidth=0.8)
-        axes.errorbar(places, off, yerr=2.0 * np.array(sd), fmt="o", color=BLUE, capsize=4.0)
+        axes.errorbar(
+            places, differences, yerr=2.0 * np.array(sd), fmt="o", color=BLUE, capsize=4.0
+        )
         name_ticks(axes, places, [target.target for target in placed])
         axes.set_xlim(-0.5, len(placed) - 0.5)
-        axes.set_ylabel("diameter: placed − stated [‰]")
+        axes.set_ylabel("diameter: measured − stated [‰]")
         return picture(figure)
 
 
 def _shortened(name: str) -> str:
-    return printable(name if len(name) <= _NAME_LETTERS else f"{name[: _NAME_LETTERS - 1]}…")
+    return printable(
+        name if len(name) <= _MAX_NAME_LETTERS else f"{name[: _MAX_NAME_LETTERS - 1]}…"
+    )
 
 
 def name_ticks(axes: Axes, places: FloatArray | IndexArray, names: list[str]) -> None:
-    """Write names below their places: upright if they fill the line, not all if they are many."""
-    shown = slice(None, None, math.ceil(len(names) / _MOST_NAMES))
+    """Write names below their places: upright if they fill the line, some if they are many."""
+    shown = slice(None, None, math.ceil(len(names) / _MAX_NAMES))
     texts = [_shortened(name) for name in names[shown]]
-    is_upright = max(map(len, texts)) * len(texts) > _LINE_LETTERS
+    is_upright = max(map(len, texts)) * len(texts) > _MAX_LINE_LETTERS
     rotation = 90.0 if is_upright else 0.0
     axes.set_xticks(places[shown], texts, parse_math=False, rotation=rotation)  # may have dollars
 
 
 def _positions(placed: tuple[PlacedTarget, ...]) -> Picture:
-    """Draw the places' residuals with two standard deviations."""
+    """Draw the positions' residuals with two standard deviations."""
     stated = [target for target in placed if target.check.residual_m is not None]
     with sheet(3.8) as figure:
         axes = figure.subplots()
         axes.axhline(0.0, color="black", linewidth=0.8)
         for index, (name, colour) in enumerate(_COLOURS.items()):
-            off = np.array([_residual_mm(target, index) for target in stated])
+            differences = np.array([_residual_mm(target, index) for target in stated])
             sd = np.array([_sd_mm(target, index) for target in stated])
             places = np.arange(len(stated)) + 0.2 * (index - 1)
             axes.errorbar(
-                places, off, yerr=2.0 * sd, fmt="o", color=colour, capsize=4.0, label=name
+                places, differences, yerr=2.0 * sd, fmt="o", color=colour, capsize=4.0, label=name
             )
         name_ticks(axes, np.arange(len(stated)), [target.target for target in stated])
         axes.set_xlim(-0.5, len(stated) - 0.5)
-        axes.set_ylabel("place: placed − stated [mm]")
+        axes.set_ylabel("position: measured − stated [mm]")
         axes.legend(ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
         return picture(figure)
 
@@ -104,7 +108,7 @@ def _frames(placed: tuple[PlacedTarget, ...]) -> Picture:
             first += len(rows) + 1
         axes.set_yscale("log")
         name_ticks(axes, np.array(middles), [target.target for target in placed])
-        axes.set_xlabel("frames, target by target (×: left out)")
-        axes.set_ylabel("χ² of five numbers")
+        axes.set_xlabel("frames, target by target (×: excluded)")
+        axes.set_ylabel("χ² of 5 numbers")
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))
         return picture(figure)

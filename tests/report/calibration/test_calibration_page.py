@@ -95,11 +95,12 @@ def test_heights_are_drawn_towards_the_camera_on_either_side(
 def test_a_good_fit_is_told_with_what_it_does_not_determine(calibration: CameraCalibration) -> None:
     told = fit_words(calibration)
     assert re.fullmatch(
-        r"Discs fit to 0\.01\d px and are measured to 0\.014 px; all parameters are determined\.",
+        r"The RMS of the residuals is 0\.01\d px, the standard deviation of a measured disc"
+        r" 0\.014 px; all parameters are determined\.",
         told,
     )
     weak = replace(calibration, undetermined=("k2",), tangled=("cx", "p1"))
-    said = "k2 not determined by these photographs; cx, p1 not told apart."
+    said = "k2 not determined by these photographs; cx, p1 cannot be separated."
     assert fit_words(weak).endswith(said)
 
 
@@ -107,12 +108,12 @@ def test_a_good_fit_is_told_with_what_it_does_not_determine(calibration: CameraC
     ("points", "has_bar", "told"),
     [
         (PointModel.STIFF, False, ""),
-        (PointModel.STIFF, True, "The scale is that of the bars."),
-        (PointModel.FREE, False, "Shift, turn and scale are those of the nominal field."),
+        (PointModel.STIFF, True, "The scale comes from the bars."),
+        (PointModel.FREE, False, "Shift, rotation and scale are those of the nominal field."),
         (
             PointModel.FREE,
             True,
-            "The scale is that of the bars. Shift and turn are those of the nominal field.",
+            "The scale comes from the bars. Shift and rotation are those of the nominal field.",
         ),
     ],
 )
