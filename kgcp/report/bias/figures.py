@@ -1,4 +1,4 @@
-"""Figures of the bias report: residuals, detection rates, what exposure does, and the camera."""
+"""Figures of the bias report: errors, detection rates, effects of exposure, and the camera."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from kgcp.report.style import BLUE, GREEN, GREY, VERMILION, Picture, Points, pic
 
 WINDOW_M = 10.0  # of the paper's Figure 9
 _SIGNED = "PuOr"  # orange and violet: distinct to all kinds of colour vision
-_WIDE = 4.0  # span of radii from which on an axis of powers of two has at least two of them
+_MIN_LOG_RATIO = 4.0  # of radii: a logarithmic axis then shows at least two powers of two
 _BINS = [0.5 * step - 5.25 for step in range(22)]
 
 _FULL_SCALE = 255.0  # of grey values
-_GREY_BINS, _FEWEST_OF_BIN = 8, 3
+_GREY_BINS, _MIN_PER_BIN = 8, 3
 _CONFIDENCE = 1.96  # standard deviations: 95 %
 
 
@@ -35,7 +35,7 @@ def draw_figures(
     reexposed: Sequence[Reexposed],
     learnt: LearntImaging | None,
 ) -> Mapping[str, Picture]:
-    """Return the figures that the numbers have something for, by their names."""
+    """Return the figures for which there are numbers, by their names."""
     pictures = {"error": error_against_distance(numbers)}
     if learnt is not None:
         pictures["camera"] = learnt_camera(learnt)
@@ -56,7 +56,7 @@ def draw_figures(
 
 
 def error_against_distance(numbers: BiasNumbers) -> Picture:
-    """Draw the paper's Figure 9: errors with moving mean and spread, in metres and percent."""
+    """Draw the paper's Figure 9: errors with moving mean and sd, in metres and percent."""
     distance = numbers.data.distance_m
     with sheet(6.2) as figure:
         upper, lower = figure.subplots(2, 1, sharex=True)
@@ -143,12 +143,12 @@ def _rates(axes: Axes, rates: Sequence[DetectionRate], centre: Sequence[float]) 
 def standardised_histogram(numbers: BiasNumbers) -> Picture:
     """Draw errors over their reported standard deviations, and the normal distribution."""
     raw = numbers.data.residual_m / numbers.sd_m
-    left = (numbers.data.residual_m - _systematic_m(numbers)) / numbers.sd_m
+    remaining = (numbers.data.residual_m - _systematic_m(numbers)) / numbers.sd_m
     with sheet(3.8) as figure:
         axes = figure.subplots()
         for values, colour, filled, label in (
             (raw, BLUE, True, "error / reported sd"),
-            (left, VERMILION, False, "without scale and offset"),
+            (remaining, VERMILION, False, "without scale and offset"),
         ):
             shown = np.clip(values[np.isfinite(values)], _BINS[0], _BINS[-1])
             share = np.full(len(shown), 1.0 / (len(shown) * 0.5))
@@ -165,7 +165,7 @@ def standardised_histogram(numbers: BiasNumbers) -> Picture:
         x = np.linspace(-5.0, 5.0, 201)
         normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
         axes.plot(x, normal, "--", color="black", linewidth=1.5, label="normal, sd 1")
-        axes.set_xlabel("error / reported standard deviation  (ends: and beyond)")
+        axes.set_xlabel("error / reported standard deviation  (outer bins: all beyond)")
         axes.set_ylabel("density")
         drawn = axes.get_legend_handles_labels()
         figure.legend(*drawn, loc="outside upper center", ncols=3, columnspacing=1.0)
@@ -177,11 +177,11 @@ def _systematic_m(numbers: BiasNumbers) -> FloatArray:
 
 
 def error_in_time(numbers: BiasNumbers) -> Picture:
-    """Draw errors in metres in time, or in the frames' order where not all have a time."""
+    """Draw errors in metres over time, or in the order of frames if some have no time."""
     time_s = np.array([pair.attempt.time_s for pair in numbers.compared], dtype=np.float64)
-    minutes, label = (time_s - time_s[0]) / 60.0, "time since the first [min]"
+    minutes, label = (time_s - time_s[0]) / 60.0, "time since the first measurement [min]"
     if not np.isfinite(time_s).all():
-        minutes, label = np.arange(float(len(time_s))), "frame, in order"
+        minutes, label = np.arange(float(len(time_s))), "frames in order"
     with sheet(3.2) as figure:
         axes = figure.subplots()
         axes.axhline(0.0, color="black", linewidth=0.8)
@@ -207,7 +207,7 @@ def error_over_image(numbers: BiasNumbers, camera: Camera) -> Picture:
 
 
 def flight_map(numbers: BiasNumbers) -> Picture:
-    """Draw where the cameras were, and where the target was, coloured by the error."""
+    """Draw the positions of cameras and target, coloured by the error."""
     places = np.array([pair.target_m for pair in numbers.compared])
     cameras = np.array([pair.camera_m for pair in numbers.compared])
     with sheet(4.8) as figure:
@@ -243,7 +243,7 @@ def _coloured(
 
 def error_against_exposure(numbers: BiasNumbers) -> Picture:
     """Draw residual and δ against every exposure quantity that varies, with fitted slopes."""
-    left = numbers.residual_percent - numbers.explained_percent
+    remaining = numbers.residual_percent - numbers.explained_percent
     shift = numbers.data.exposure["edge_shift_px"]
     displaced = [
         influence
@@ -254,12 +254,14 @@ def error_against_exposure(numbers: BiasNumbers) -> Picture:
     with sheet(2.3 * count) as figure:
         panels = iter(figure.subplots(count, 2, squeeze=False).ravel())
         points = []
-        # pairs side by side, and δ, which has no partner, behind them
+        # error and δ side by side; panels of the error without one of δ follow
         alone = [influence for influence in numbers.influences if influence not in displaced]
         for influence in (*displaced, *alone):
             axes = next(panels)
             axes.axhline(0.0, color="black", linewidth=0.8)
-            points.append(scatter(axes, influence.rows, influence.values, left[influence.rows]))
+            points.append(
+                scatter(axes, influence.rows, influence.values, remaining[influence.rows])
+            )
             _line(axes, influence, influence.residual)
             axes.set_ylabel("error [%]", fontsize=11)
             if influence not in displaced:
@@ -323,7 +325,7 @@ def one_edge_against_two(numbers: BiasNumbers, edges: EdgeNumbers) -> Picture:
 
 
 def change_by_reexposure(results: Sequence[Reexposed]) -> Picture:
-    """Draw the paper's Figure 10: how distances move when grey values are multiplied."""
+    """Draw the paper's Figure 10: changes of distances when grey values are multiplied."""
     gains = sorted({result.gain for result in results})
     colours = dict(zip(gains, (BLUE, VERMILION, GREEN, GREY), strict=False))
     with sheet(3.8) as figure:
@@ -332,17 +334,19 @@ def change_by_reexposure(results: Sequence[Reexposed]) -> Picture:
         points: list[Points] = []
         for gain in gains:
             of_gain = [result for result in results if result.gain == gain]
-            kept = [result for result in of_gain if result.change_percent is not None]
-            lost = [result for result in of_gain if result.change_percent is None]
+            measured = [result for result in of_gain if result.change_percent is not None]
+            failed = [result for result in of_gain if result.change_percent is None]
             label = f"grey × {gain:g}"
-            if kept:
-                marker = "v" if gain < 1.0 else "^"  # both are seen where the changes agree
-                points.append(_changes(axes, kept, colours[gain], marker, label))
-            if lost:
-                x = np.array([result.radius_px for result in lost])
-                axes.plot(x, np.zeros(len(x)), "x", color=colours[gain], label=f"{label}: lost")
+            if measured:
+                marker = "v" if gain < 1.0 else "^"  # both stay visible where changes agree
+                points.append(_changes(axes, measured, colours[gain], marker, label))
+            if failed:
+                x = np.array([result.radius_px for result in failed])
+                axes.plot(
+                    x, np.zeros(len(x)), "x", color=colours[gain], label=f"{label}: not measured"
+                )
         radii = [result.radius_px for result in results]
-        if max(radii) > _WIDE * min(radii):
+        if max(radii) > _MIN_LOG_RATIO * min(radii):
             axes.set_xscale("log", base=2)
             axes.xaxis.set_major_formatter(lambda value, _: f"{value:.0f}")
         axes.set_xlabel("radius of the ring [px]")
@@ -351,12 +355,14 @@ def change_by_reexposure(results: Sequence[Reexposed]) -> Picture:
         return picture(figure, points)
 
 
-def _changes(axes: Axes, kept: Sequence[Reexposed], colour: str, marker: str, label: str) -> Points:
-    x = np.array([result.radius_px for result in kept])
-    y = np.array([result.change_percent for result in kept], dtype=np.float64)
-    sd = np.array([result.sd_percent or 0.0 for result in kept])
+def _changes(
+    axes: Axes, measured: Sequence[Reexposed], colour: str, marker: str, label: str
+) -> Points:
+    x = np.array([result.radius_px for result in measured])
+    y = np.array([result.change_percent for result in measured], dtype=np.float64)
+    sd = np.array([result.sd_percent or 0.0 for result in measured])
     axes.errorbar(x, y, yerr=sd, fmt=marker, color=colour, elinewidth=1.0, capsize=3, label=label)
-    return Points(axes, np.array([result.row for result in kept], dtype=np.intp), x, y)
+    return Points(axes, np.array([result.row for result in measured], dtype=np.intp), x, y)
 
 
 def learnt_camera(learnt: LearntImaging) -> Picture:
@@ -365,7 +371,7 @@ def learnt_camera(learnt: LearntImaging) -> Picture:
         upper, lower = figure.subplots(2, 1, sharex=True)
         _draw_curve(upper, learnt)
         _draw_noise(lower, learnt)
-        lower.set_xlabel("grey value, of 255")
+        lower.set_xlabel("grey value (0 … 255)")
         figure.legend(*upper.get_legend_handles_labels(), loc="outside upper center", ncols=3)
         return picture(figure)
 
@@ -374,7 +380,7 @@ def _draw_curve(axes: Axes, learnt: LearntImaging) -> None:
     grey, (low, middle, high) = _FULL_SCALE * learnt.grey, learnt.light
     axes.plot(grey, srgb_decoded(learnt.grey), "--", color=GREY, linewidth=1.4, label="sRGB")
     axes.fill_between(grey, low, high, color=VERMILION, alpha=0.25, linewidth=0.0, label="± 1 sd")
-    axes.plot(grey, middle, color=VERMILION, linewidth=2.0, label="learnt")
+    axes.plot(grey, middle, color=VERMILION, linewidth=2.0, label="estimated")
     axes.set_ylabel("light")
 
 
@@ -385,9 +391,9 @@ def _draw_noise(axes: Axes, learnt: LearntImaging) -> None:
     middles, medians = [], []
     for first, last in pairwise(edges):
         within = (grey >= first) & (grey < last)
-        if within.sum() >= _FEWEST_OF_BIN:
+        if within.sum() >= _MIN_PER_BIN:
             middles.append(0.5 * (first + last))
             medians.append(float(np.median(sd[within])))
     axes.plot(middles, medians, color=VERMILION, linewidth=2.0)
-    axes.set_ylabel("noise, grey values")
+    axes.set_ylabel("noise [grey values]")
     axes.set_ylim(bottom=0.0)

@@ -1,4 +1,4 @@
-"""The numbers of the bias report: the study, reduced to what figures and sentences show."""
+"""The numbers of the bias report: what figures and sentences show of the study."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from kgcp.quality.statistics import Slope, Spread, fit_slope, wilson_interval
 from kgcp.settings import Method
 
 WORST, SPREAD = 12, 24
-"""Numbers of close-ups: of the largest residuals, and evenly over the distances."""
+"""Numbers of close-ups: of the largest residuals, and evenly spread over the distances."""
 
 BIN_M = 10.0
-NEAR_M = 50.0  # the paper states its accuracy below and above
+NEAR_M = 50.0  # the paper states accuracies below and above this distance
 _BIASED_SIGMAS = 3.0
 _RADIUS_PX, _RADII_PER_OCTAVE = 13.0, 2.0  # borders at 13 px and at every factor of √2 from there
 
@@ -40,29 +40,29 @@ class RangeRow:
     # of the errors [%] and [m]
     percent: Spread
     metres: Spread
-    # mean standard deviation of the reference distances [%]; None where none is known
+    # mean standard deviation of the reference distances [%]; None: unknown
     sd_reference_percent: float | None
 
     @property
     def sd_mean_percent(self) -> float | None:
         """Standard deviation of the mean error by its own noise and by the reference [%].
 
-        Errors of a trajectory and of reference poses last for many frames: averaging is not
-        trusted to lessen them.
+        Errors of a trajectory and of reference poses are correlated over many frames, so averaging
+        is not assumed to reduce them.
         """
-        own = self.percent.sd_mean
-        return None if own is None else math.hypot(own, self.sd_reference_percent or 0.0)
+        noise = self.percent.sd_mean
+        return None if noise is None else math.hypot(noise, self.sd_reference_percent or 0.0)
 
     @property
     def is_biased(self) -> bool:
-        """Whether the mean error stands out from noise and the reference's errors."""
+        """Whether noise and errors of the reference do not explain the mean error."""
         sd = self.sd_mean_percent
         return sd is not None and abs(self.percent.mean) > _BIASED_SIGMAS * sd
 
 
 @dataclass(frozen=True, slots=True)
 class DetectionRate:
-    """Share of the frames that must show the target in which it was measured, for one range."""
+    """Share of the frames showing the target in which it was measured, for one range."""
 
     # borders of the range: of distances [m] or of radii [px]
     low: float
@@ -81,18 +81,18 @@ class DetectionRate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Influence:
-    """One exposure quantity that varies, and what follows it."""
+    """One exposure quantity that varies, and what depends on it."""
 
     quantity: Quantity
     rows: IndexArray  # (m,): of the measurements that have it
     values: FloatArray  # (m,): as in the detections
-    residual: Slope | None  # of the error [%], without scale and offset, by the quantity's own unit
-    edge_shift: Slope | None  # of δ [px], the same; None for δ itself
+    residual: Slope | None  # of the error [%] without scale and offset, per unit of the quantity
+    edge_shift: Slope | None  # of δ [px], per unit of the quantity; None for δ itself
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeNumbers:
-    """Distances by the outer edge alone against those by both edges."""
+    """Distances by the outer edge alone, compared with those by both edges."""
 
     rows: IndexArray  # (m,): of the measurements that have both
     # (m,): residuals [m]
@@ -109,10 +109,10 @@ class EdgeNumbers:
 class BiasNumbers:
     """All numbers of one report."""
 
-    compared: tuple[Comparison, ...]  # the trusted measurements, in time
-    data: DistanceResiduals  # theirs
+    compared: tuple[Comparison, ...]  # the trusted measurements, in the order of time
+    data: DistanceResiduals  # of these measurements
     residual_percent: FloatArray  # (n,): errors in percent of the reference distance
-    # (n,): what the regression explains of them without exposure; 0 without a regression
+    # (n,): part of them that the regression explains without exposure; 0 without a regression
     explained_percent: FloatArray
     # (n,): reported standard deviations of the errors, of measurement and reference; NaN where the
     # measurement has none
@@ -123,8 +123,8 @@ class BiasNumbers:
     # per 10 m, and per radius of the ring
     rates: tuple[DetectionRate, ...]
     radius_rates: tuple[DetectionRate, ...]
-    regression: Regression | None  # None where there is too little for one
-    edges: EdgeNumbers | None  # None where no measurement has δ
+    regression: Regression | None  # None: too few measurements, or distances too similar
+    edges: EdgeNumbers | None  # None: no measurement has δ
     influences: tuple[Influence, ...]  # of the exposure quantities that vary
     standardised: Spread | None  # of the errors over their reported standard deviations
     sd_reference_m: float | None  # median standard deviation of the reference distances
@@ -132,7 +132,7 @@ class BiasNumbers:
     # over all distances
     detected: int
     expected_visible: int
-    left_out: tuple[tuple[str, int], ...]  # frames that could not be compared: why and how many
+    left_out: tuple[tuple[str, int], ...]  # frames that were not compared: reasons and counts
     attitudes_agree: bool  # as in the study
 
     @property
@@ -142,7 +142,7 @@ class BiasNumbers:
 
     @property
     def biased(self) -> tuple[RangeRow, ...]:
-        """The ranges whose mean error stands out from its own noise: all, or halves of it."""
+        """The ranges with a bias: all distances, or else near or far ones."""
         if self.total.is_biased:
             return (self.total,)
         return tuple(half for half in self.halves if half.is_biased)
@@ -156,8 +156,10 @@ class BiasNumbers:
     @property
     def standardised_residuals(self) -> FloatArray:
         """Errors without scale and offset (n,), over their standard deviations."""
-        left = self.residual_percent - self.explained_percent
-        return np.asarray(left / (100.0 * np.sqrt(self.data.errors.total) / self.data.distance_m))
+        remaining = self.residual_percent - self.explained_percent
+        return np.asarray(
+            remaining / (100.0 * np.sqrt(self.data.errors.total) / self.data.distance_m)
+        )
 
     @property
     def worst(self) -> list[int]:
@@ -166,7 +168,7 @@ class BiasNumbers:
 
 
 def bias_numbers(study: BiasStudy) -> BiasNumbers:
-    """Reduce a study to its numbers; at least one trusted measurement is needed."""
+    """Return the numbers of a study with at least one trusted measurement."""
     compared = in_time(study.trusted)
     measured = [pair.attempt.sighting for pair in compared if pair.attempt.sighting]
     data = DistanceResiduals.of(compared, np.array([sighting.distance_m for sighting in measured]))
@@ -219,7 +221,7 @@ def bias_numbers(study: BiasStudy) -> BiasNumbers:
 
 
 def evenly(distance_m: FloatArray, count: int) -> list[int]:
-    """Return up to `count` of the rows (n,), evenly over the ranks of the distance, near to far."""
+    """Return up to `count` rows (n,), evenly spread over the ranks of distance, near to far."""
     ranked = np.argsort(distance_m, kind="stable")
     places = np.unique(np.linspace(0, len(ranked) - 1, min(count, len(ranked))).round())
     chosen: list[int] = ranked[places.astype(int)].tolist()
@@ -327,7 +329,7 @@ def _influences(data: DistanceResiduals, percent: FloatArray) -> tuple[Influence
         if not varies(x[rows]):
             continue
         both = rows[np.isfinite(shift[rows])]
-        own = quantity.name == "edge_shift_px" or not varies(shift[both])
+        has_no_shift = quantity.name == "edge_shift_px" or not varies(shift[both])
         influences.append(
             Influence(
                 quantity,
@@ -335,7 +337,7 @@ def _influences(data: DistanceResiduals, percent: FloatArray) -> tuple[Influence
                 column[rows],
                 fit_slope(x[rows], percent[rows], sd_percent[rows]),
                 None
-                if own
+                if has_no_shift
                 else fit_slope(x[both], shift[both], np.ones(len(both)), is_robust=False),
             )
         )

@@ -1,4 +1,4 @@
-"""What a bias report was made from, in print: program, frames, camera, target, files, settings."""
+"""Inputs and settings of a bias report, as text: program, frames, camera, target, files."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from kgcp.settings import DetectSettings, Method
 from kgcp.targets.layout import Target
 from kgcp.targets.plain import AnyTarget, PlainTarget
 
-_LONGEST = 80  # of a CRS in print
-_DIGITS = 8  # of a file's digest
+_MAX_CRS_LETTERS = 80  # a longer CRS is cut
+_DIGEST_DIGITS = 8  # of a file's digest, that are printed
 
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """One line of what a report was made from."""
+    """One line of the inputs and settings."""
 
     label: str
     text: str
@@ -49,7 +49,7 @@ def facts(
     outcomes: Outcomes | None,
     provenance: Mapping[str, str],
 ) -> tuple[Fact, ...]:
-    """Return what a report was made from, line by line.
+    """Return the inputs and settings of a report, line by line.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def facts(
 
 
 def _short(text: str) -> str:
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+    return text if len(text) <= _MAX_CRS_LETTERS else f"{text[:_MAX_CRS_LETTERS]}…"
 
 
 def _program(provenance: Mapping[str, str]) -> str:
@@ -94,9 +94,9 @@ def _frames(outcomes: Outcomes | None) -> Iterator[Fact]:
         median_px, largest_px = outcomes.eccentricity_px
         yield Fact(
             "Eccentricity",
-            f"centroids of the targets' images lie {median_px:.3f} px (median) to"
-            f" {largest_px:.3f} px from the images of their centres, which are reported;"
-            " programs that measure centroids are off by as much",
+            f"centroids of the targets' images lie {median_px:.3f} px (median), at most"
+            f" {largest_px:.3f} px from the images of the centres; kgcp reports the centres;"
+            " programs that measure centroids have this error",
         )
 
 
@@ -110,7 +110,7 @@ def _camera(flight: Flight) -> str:
     terms = [f"{name} {minus(f'{value:g}')}" for name in names if (value := getattr(camera, name))]
     shutter = f"; readout {1000.0 * camera.readout_s:g} ms" if camera.readout_s else ""
     is_stated = flight.calibration_covariance is not None
-    stated = "stated" if is_stated else "not stated (kgcp calibrate states it)"
+    stated = "stated" if is_stated else "not stated ('kgcp calibrate' determines it)"
     return (
         f"{camera.width} × {camera.height} px; fx {camera.fx:g}, fy {camera.fy:g},"
         f" cx {camera.cx:g}, cy {camera.cy:g} px; {', '.join(terms) or 'no distortion'};"
@@ -154,17 +154,17 @@ def _files(flight: Flight, provenance: Mapping[str, str]) -> Iterator[str]:
 
 def _file(path: Path | None, digest: str | None) -> Iterator[str]:
     if path is not None:
-        yield path.name if digest is None else f"{path.name} ({digest[:_DIGITS]})"
+        yield path.name if digest is None else f"{path.name} ({digest[:_DIGEST_DIGITS]})"
 
 
 def _settings(settings: DetectSettings) -> str:
-    again = "" if settings.is_guided else "; no second pass"
+    restrictions = "" if settings.is_guided else "; no second pass"
     if settings.method is Method.PAPER:
-        again += "; the closed-form chain alone"
+        restrictions += "; closed-form chain only"
     return (
-        f"method {settings.method.value}; rings from {settings.min_radius_px:g} px; score from"
-        f" {settings.min_score:g}; at most one false alarm in {1.0 / settings.false_alarm:.0f}"
-        f" frames{again}"
+        f"method {settings.method.value}; radius of rings at least {settings.min_radius_px:g} px;"
+        f" score at least {settings.min_score:g}; at most one false alarm in"
+        f" {1.0 / settings.false_alarm:.0f} frames{restrictions}"
     )
 
 
@@ -172,15 +172,16 @@ def agreement(consistency: Consistency | None) -> str:
     """Return one sentence on how well vehicle and camera agree."""
     if consistency is None:
         return (
-            "Not examined: it takes ten frames with the moving target, a reference pose and a time."
+            "Not examined: this requires ten frames with the moving target, a reference pose and a"
+            " time."
         )
     rms = rms_m(consistency)
-    is_near = max(rms) < 1.0
-    along, across, up = (f"{1000.0 * m:.0f} mm" if is_near else f"{m:.2f} m" for m in rms)
+    is_small = max(rms) < 1.0
+    along, across, up = (f"{1000.0 * m:.0f} mm" if is_small else f"{m:.2f} m" for m in rms)
     outliers = sum(each.is_outlier for each in consistency.discrepancies)
-    due = "" if advice(consistency) else " No correction of flight.toml is due."
+    remark = "" if advice(consistency) else " flight.toml needs no correction."
     return (
         f"The target's positions by vehicle and by camera differ by {along} along the track,"
         f" {across} across and {up} up (RMS of {len(consistency.discrepancies) - outliers} frames,"
-        f" {outliers} outliers).{due}"
+        f" {outliers} outliers).{remark}"
     )

@@ -15,16 +15,16 @@ from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
 
 GAINS = (0.6, 1.6)
-_SD_PX, _SD_LOG_RADIUS = 0.5, 0.02  # how sure it is that the target is where it was
-_REACH = 4.0  # of the ring's radius: size of the part of the frame that is changed
-_LEAST_REACH_PX = 60.0
+_SD_PX, _SD_LOG_RADIUS = 0.5, 0.02  # of the prediction: the target has not moved
+_REACH = 4.0  # from the centre, in ring radii, within which grey values are changed
+_MIN_REACH_PX = 60.0
 
 
 @dataclass(frozen=True, slots=True)
 class Reexposed:
     """One target measured again."""
 
-    row: int  # of the measurement, by its place in time
+    row: int  # of the measurement, in the order of time
     gain: float  # factor of the grey values
     radius_px: float  # of the ring
     change_percent: float | None  # of the distance; None: the target was not measured again
@@ -47,10 +47,10 @@ def measure_again(
     radius_px: float,
     row: int,
 ) -> list[Reexposed]:
-    """Measure one target with its grey values as they are, and times each of `GAINS`.
+    """Measure one target with its grey values unchanged and times each of `GAINS`.
 
-    It is looked for only where it is, whatever the size of the frame. Empty if it is not found
-    there unchanged.
+    The target is searched for only at its known position, whatever the size of the frame.
+    The list is empty if it is not measured there with unchanged grey values.
     """
     prediction = Prediction(centre_px, _SD_PX, radius_px, _SD_LOG_RADIUS, "the unchanged frame")
 
@@ -84,8 +84,8 @@ def _compare(
 def _reexposed_around(
     grey: GreyArray, gain: float, centre_px: FloatArray, radius_px: float
 ) -> GreyArray:
-    """Return a frame with other grey values where the measurement uses it."""
-    reach = max(_LEAST_REACH_PX, _REACH * radius_px)
+    """Return a frame whose grey values are changed around the ring, where they are used."""
+    reach = max(_MIN_REACH_PX, _REACH * radius_px)
     left, top = np.maximum(np.floor(centre_px - reach), 0).astype(int)
     right, bottom = np.ceil(centre_px + reach).astype(int)
     changed = grey.copy()

@@ -55,7 +55,7 @@ def test_radii_are_numbered_however_close_they_are(
 def test_the_legend_names_only_what_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     panel = reexposure_panel(monkeypatch, [reexposed(0.6, 22.0), reexposed(1.6, 22.0, None)])
     _, labels = panel.get_legend_handles_labels()
-    assert sorted(labels) == ["grey × 0.6", "grey × 1.6: lost"]
+    assert sorted(labels) == ["grey × 0.6", "grey × 1.6: not measured"]
 
 
 def test_darker_and_brighter_frames_have_different_marks(monkeypatch: pytest.MonkeyPatch) -> None:

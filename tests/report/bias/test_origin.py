@@ -1,4 +1,4 @@
-"""What a report says it was made from."""
+"""Inputs and settings of a report."""
 
 from __future__ import annotations
 
@@ -38,25 +38,25 @@ def test_every_part_is_named(flight: Flight) -> None:
         "Program": "kgcp 0.1.0",
         "Frames": "24: 21 measured, 3 out of view",
         "Time of the frames": "2026-06-16 08:15:05 to 2026-06-16 08:15:39 UTC",
-        "Eccentricity": "centroids of the targets' images lie 0.012 px (median) to 0.456 px from"
-        " the images of their centres, which are reported; programs that measure centroids are off"
-        " by as much",
+        "Eccentricity": "centroids of the targets' images lie 0.012 px (median), at most 0.456 px"
+        " from the images of the centres; kgcp reports the centres; programs that measure centroids"
+        " have this error",
         "Camera": "1200 × 900 px; fx 1903, fy 1901, cx 606.2, cy 446.1 px; k1 −0.081, k2 0.064,"
         " p1 0.0003, p2 0.0005; response linear; accuracy of the calibration not stated"
-        " (kgcp calibrate states it)",
+        " ('kgcp calibrate' determines it)",
         "Target": "A: 0.9 m across, inner circle 0.45 m, dots at 0, 43, 78, 180°; with A-inner;"
         " accuracy of the print not stated",
         "CRS": "EPSG:25832",
         "Files": "flight.toml, frames.csv (0bfa8c54), vehicle.csv (ae329332), reference.csv"
         " (4944925a)",
-        "Settings": "method model; rings from 6 px; score from 0.86; at most one false alarm in"
-        " 100000 frames",
+        "Settings": "method model; radius of rings at least 6 px; score at least 0.86; at"
+        " most one false alarm in 100000 frames",
     }
     inner["version"] = "0.0.9"
     older = {"version": "0.1.0", "detections": json.dumps(inner)}
     paper = texts(flight, DetectSettings(method=Method.PAPER, is_guided=False), older)
     assert paper["Program"] == "kgcp 0.1.0; detections by kgcp 0.0.9"
-    assert paper["Settings"].endswith("; no second pass; the closed-form chain alone")
+    assert paper["Settings"].endswith("; no second pass; closed-form chain only")
 
 
 def test_the_headline_identifies_the_flight(flight: Flight) -> None:
@@ -72,4 +72,4 @@ def test_what_is_not_known_is_left_out(flight: Flight) -> None:
     assert "Eccentricity" not in labels
     assert "Frames" not in [fact.label for fact in facts(flight, DetectSettings(), None, {})]
     assert "flown" not in headline(flight, timeless)
-    assert agreement(None).startswith("Not examined: it takes ten frames")
+    assert agreement(None).startswith("Not examined: this requires ten frames")
