@@ -1,4 +1,4 @@
-"""The contact sheet: a folder with a page, and a picture with a thumbnail for every ring."""
+"""The contact sheet: a folder with a page, and with a picture and a thumbnail of every ring."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from kgcp.report.ring_picture import FULL_SCALE, THUMBNAIL_PX, Pictures
 PAGE = "index.html"
 _PICTURES, _THUMBNAILS = "pictures", "thumbnails"
 DROPPED = "candidate"
-"""Status of a card without a row in the table: a ring that was compared and dropped."""
+"""Status of a card without a row in the table: of a ring that was compared and rejected."""
 
-_OWN_NAME = re.compile(r"\d{6,}-\d+\.jpg")
-_MARK = '<meta name="generator" content="kgcp'
-_HEAD = 2000  # characters at the beginning of a page that must contain the mark
+_PICTURE_NAME = re.compile(r"\d{6,}-\d+\.jpg")
+_GENERATOR = '<meta name="generator" content="kgcp'
+_HEAD_LENGTH = 2000  # characters at the beginning of a page, which contain the generator
 
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """Entry of the page for one row of the table, or for a ring that was dropped."""
+    """Entry of the page for one row of the table, or for a rejected ring."""
 
     # as in the table; or the status `DROPPED`
     frame: str
@@ -35,15 +35,15 @@ class Card:
     instance: int
     status: str
     reason: str
-    # the main value, and the others
+    # main value, and other values as text
     headline: str
     text: str
-    # what the page can sort by
+    # keys by which the page sorts
     distance_m: float | None = None
     sd_percent: float | None = None
     radius_px: float | None = None
     residual_percent: float | None = None
-    stem: str | None = None  # of the picture's files; None: there is none
+    stem: str | None = None  # name of the picture's files without suffix; None: no picture
 
     @property
     def is_point(self) -> bool:
@@ -52,7 +52,7 @@ class Card:
 
 
 class ContactSheet:
-    """A folder that becomes a contact sheet; its page appears last, after all pictures.
+    """Writer of a contact sheet; the page appears last, after all pictures.
 
     Parameters
     ----------
@@ -62,13 +62,13 @@ class ContactSheet:
     Raises
     ------
     KgcpError
-        If the folder contains a page of another program. Here and in all methods, if it cannot be
-        written.
+        If the folder contains a page of another program. All methods raise it if the folder cannot
+        be written.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._kept: set[str] = set()
+        self._written: set[str] = set()
         self.page = folder / PAGE
         try:
             for name in (_PICTURES, _THUMBNAILS):
@@ -88,7 +88,7 @@ class ContactSheet:
     def add(self, stem: str, pictures: Pictures) -> None:
         """Write a picture and its thumbnail."""
         name = f"{stem}.jpg"
-        self._kept.add(name)
+        self._written.add(name)
         for folder, content in (
             (_PICTURES, pictures.picture),
             (_THUMBNAILS, pictures.thumbnail),
@@ -99,7 +99,7 @@ class ContactSheet:
         """Delete pictures of earlier runs, and write the page."""
         for folder in (_PICTURES, _THUMBNAILS):
             for path in (self._folder / folder).iterdir():
-                if _OWN_NAME.fullmatch(path.name) and path.name not in self._kept:
+                if _PICTURE_NAME.fullmatch(path.name) and path.name not in self._written:
                     with suppress(OSError):  # a remaining picture does no harm
                         path.unlink()
         self._write(self.page, _render(flight_name, cards).encode("utf-8"))
@@ -119,7 +119,7 @@ class ContactSheet:
 
 def _is_own(page: Path) -> bool:
     with page.open(encoding="utf-8", errors="replace") as stream:
-        return _MARK in stream.read(_HEAD)
+        return _GENERATOR in stream.read(_HEAD_LENGTH)
 
 
 def _render(flight_name: str, cards: Sequence[Card]) -> str:

@@ -17,9 +17,9 @@ from kgcp.io.print.typeface import printable
 from kgcp.report.style import BLUE, GREY, VERMILION, sheet
 from kgcp.simulation.outlook import Outlook
 
-_WIDE_RATIO = 50.0  # of the deviations, above which only powers of ten are labelled
-_LABEL_SHARE = 0.075  # of the axis, taken by the label of a height
-_TITLE_LETTERS = 48  # per line
+_MAX_FINE_RATIO = 50.0  # of the standard deviations; above, only powers of ten are labelled
+_LABEL_SHARE = 0.075  # width of the label of a height, as share of the axis
+_MAX_TITLE_LETTERS = 48  # per line
 _METADATA: dict[str, dict[str, str | None]] = {
     ".png": {"Software": None},
     ".svg": {"Date": None, "Creator": None},
@@ -50,10 +50,10 @@ def write_plan_figure(outlooks: Sequence[Outlook], title: str, path: Path) -> No
     stream = io.BytesIO()
     with sheet(9.6) as figure:
         panels = figure.subplots(4, 1, sharex=True)
-        lines = textwrap.fill(printable(title), _TITLE_LETTERS)
+        lines = textwrap.fill(printable(title), _MAX_TITLE_LETTERS)
         figure.suptitle(lines, fontsize=12, parse_math=False)  # names may have dollars
         for draw, axes in zip(
-            (_draw_distance, _draw_centre, _draw_found, _draw_ground), panels, strict=True
+            (_draw_distance, _draw_centre, _draw_detection, _draw_footprint), panels, strict=True
         ):
             draw(axes, outlooks)
             axes.margins(x=0.09)
@@ -78,7 +78,7 @@ def _draw_distance(axes: Axes, outlooks: Sequence[Outlook]) -> None:
         axes.legend(loc="upper left", fontsize=10)
     axes.set_yscale("log")
     axes.margins(y=0.15)
-    is_wide = bool(points) and points[-1][1] > _WIDE_RATIO * points[0][1]
+    is_wide = bool(points) and points[-1][1] > _MAX_FINE_RATIO * points[0][1]
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0,) if is_wide else (1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(_plain)
     axes.yaxis.set_minor_locator(NullLocator())
@@ -94,7 +94,7 @@ def _draw_centre(axes: Axes, outlooks: Sequence[Outlook]) -> None:
     axes.set_ylabel("sd of centre [px]")
 
 
-def _draw_found(axes: Axes, outlooks: Sequence[Outlook]) -> None:
+def _draw_detection(axes: Axes, outlooks: Sequence[Outlook]) -> None:
     heights = [o.height_m for o in outlooks]
     rates = [100.0 * o.found for o in outlooks]
     below = [100.0 * (o.found - o.found_low) for o in outlooks]
@@ -104,7 +104,7 @@ def _draw_found(axes: Axes, outlooks: Sequence[Outlook]) -> None:
     axes.set_ylabel("found [%]")
 
 
-def _draw_ground(axes: Axes, outlooks: Sequence[Outlook]) -> None:
+def _draw_footprint(axes: Axes, outlooks: Sequence[Outlook]) -> None:
     """Draw the image's width and height on the ground, with the number of frames per pass."""
     heights = [o.height_m for o in outlooks]
     for side, style, label in ((0, "o-", "image width"), (1, "s--", "image height")):
@@ -122,29 +122,29 @@ def _draw_ground(axes: Axes, outlooks: Sequence[Outlook]) -> None:
     largest = max(max(o.footprint_m) for o in outlooks)
     axes.set_ylim(-0.2 * largest, 1.75 * largest)
     axes.set_yticks([tick for tick in axes.get_yticks() if 0.0 <= tick <= 1.2 * largest])
-    axes.set_ylabel("on the ground [m]")
+    axes.set_ylabel("footprint [m]")
     axes.legend(loc="upper left", fontsize=10, ncols=2)
     words = "small numbers: frames per pass"
     axes.annotate(words, (0.02, 0.7), xycoords="axes fraction", fontsize=10, color=GREY)
 
 
 def _number_heights(panels: Sequence[Axes], outlooks: Sequence[Outlook]) -> None:
-    """Write the heights below the panels, and the size of a pixel on the ground above them."""
+    """Label the heights below the panels, and the sizes of a pixel on the ground above them."""
     heights = [outlook.height_m for outlook in outlooks]
-    shown = [height for i, height in enumerate(heights) if _is_free(heights, i)]
+    labelled = [height for i, height in enumerate(heights) if _is_free(heights, i)]
     lowest, highest = panels[-1], panels[0]
-    lowest.set_xticks(shown, labels=[f"{height:g}" for height in shown])
+    lowest.set_xticks(labelled, labels=[f"{height:g}" for height in labelled])
     lowest.tick_params(axis="x", which="minor", length=0.0, labelbottom=False)
     gsd_per_m = outlooks[0].gsd_m / outlooks[0].height_m
     above = highest.secondary_xaxis("top")
-    above.set_xticks(shown, labels=[f"{1e3 * gsd_per_m * height:.2g}" for height in shown])
+    above.set_xticks(labelled, labels=[f"{1e3 * gsd_per_m * height:.2g}" for height in labelled])
     above.tick_params(axis="x", which="minor", length=0.0, labeltop=False)
     above.tick_params(axis="x", which="major", labelsize=10)
     above.set_xlabel("size of a pixel on the ground [mm]", fontsize=10)
 
 
 def _is_free(heights: Sequence[float], index: int) -> bool:
-    """Tell whether the label of a height does not overlap that of the one before."""
+    """Tell whether the label of a height does not overlap that of the height before."""
     span = math.log(heights[-1] / heights[0]) if len(heights) > 1 else 0.0
     before = heights[max(0, index - 1)]
     return index == 0 or math.log(heights[index] / before) > _LABEL_SHARE * span

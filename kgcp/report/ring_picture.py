@@ -15,22 +15,22 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.measurement.adjustment.residual_image import ResidualImage
 
 FULL_SCALE = 0.1
-"""Residuals with the full colour, as share of the contrast."""
+"""Residual that is drawn in full colour, as share of the contrast."""
 PICTURE_PX, THUMBNAIL_PX = 400, 160
 """Width and height of each square of a picture."""
 CLOSEUP_PX = 320
 """Width and height of a close-up."""
 
-_REACH, _CLOSEUP_REACH = 1.4, 1.7  # of a picture to each side, in outer radii
+_REACH, _CLOSEUP_REACH = 1.4, 1.7  # from the centre to each side, in outer radii
 _MIN_REACH_PX = 6.0
 _QUALITY = 80  # of JPEG
 _MIN_MAGNIFICATION = 2.0  # at which pixels are shown as squares
 _FRACTION_BITS = 4  # of the coordinates of lines
 # Colours that can be distinguished with all kinds of colour vision, on ink and on plate, in
 # OpenCV's order blue, green, red.
-_FITTED, _DROPPED, _CENTRE = (255, 170, 0), (0, 159, 230), (0, 94, 213)
+_FITTED, _REJECTED, _CENTRE = (255, 170, 0), (0, 159, 230), (0, 94, 213)
 _DARKER, _BRIGHTER = np.array([178.0, 114.0, 0.0]), np.array([0.0, 94.0, 213.0])
-_NOTHING = (226, 226, 226)
+_NO_VALUE = (226, 226, 226)  # outside the frame or without a model
 _OFF_PLATE = (120, 90, 60)
 
 _Picture = npt.NDArray[np.uint8]
@@ -42,9 +42,9 @@ class RingView:
 
     centre_px: FloatArray  # (2,): its centre in the raw frame [px]
     radius_px: float  # of its outer edge [px]
-    curves: Sequence[FloatArray]  # fitted contours, or the outline of a dropped ring [px]
+    curves: Sequence[FloatArray]  # fitted contours, or the outline of a rejected ring [px]
     residual_image: ResidualImage | None = None  # residuals of the fit; None: there is no fit
-    expected: Sequence[FloatArray] = ()  # dots that a dropped ring should have [px]
+    expected: Sequence[FloatArray] = ()  # dots that a rejected ring should have [px]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class Pictures:
 
 @dataclass(frozen=True, slots=True)
 class _Cut:
-    """A square of the frame; x0 and y0 may lie outside."""
+    """A square of the frame, which may extend beyond its borders."""
 
     x0: int
     y0: int
@@ -85,7 +85,7 @@ class _Cut:
         return cut
 
     def placed(self, points: FloatArray, size: int) -> FloatArray:
-        """Return the frame's points in a picture of a size, from its left and upper border [px]."""
+        """Return points of the frame in a picture of this size, from its upper left corner [px]."""
         corner = np.array([self.x0, self.y0]) - 0.5
         return np.asarray(size / self.side * (points - corner))
 
@@ -117,7 +117,7 @@ def draw_closeup(grey: GreyArray, view: RingView) -> tuple[bytes, tuple[FloatArr
     picture : bytes
         JPEG, `CLOSEUP_PX` wide and high.
     curves : tuple of (m, 2) array
-        From the picture's left and upper border [px].
+        From the picture's upper left corner [px].
     """
     cut = _Cut.around(view, _CLOSEUP_REACH)
     picture = _sized(_stretched(cut.of(grey, math.nan)), CLOSEUP_PX)
@@ -131,7 +131,7 @@ def _stretched(cut: FloatArray) -> _Picture:
     low, high = (cut[inside].min(), cut[inside].max()) if inside.any() else (0.0, 1.0)
     level = np.nan_to_num(255.0 * (cut - low) / max(high - low, 1e-9), nan=0.0)
     picture = np.repeat(np.rint(level).astype(np.uint8)[:, :, None], 3, axis=2)
-    picture[~inside] = _NOTHING
+    picture[~inside] = _NO_VALUE
     return picture
 
 
@@ -141,7 +141,7 @@ def _moved(residual_image: ResidualImage, cut: _Cut) -> _Cut:
 
 
 def _lit(white: FloatArray) -> _Picture:
-    """Return the level of white as grey, from 0 to its largest; off the plate, a plain colour."""
+    """Return the level of white as grey, from 0 to its largest; outside the plate, one colour."""
     level = np.nan_to_num(255.0 * np.clip(white, 0.0, 1.0))
     picture = np.repeat(np.rint(level).astype(np.uint8)[:, :, None], 3, axis=2)
     picture[np.isnan(white)] = _OFF_PLATE
@@ -153,7 +153,7 @@ def _coloured(residual_image: ResidualImage, cut: _Cut) -> _Picture:
     strength = np.nan_to_num(np.minimum(np.abs(share) / FULL_SCALE, 1.0))[:, :, None]
     ink = np.where(share[:, :, None] > 0.0, _BRIGHTER, _DARKER)
     picture = np.rint(255.0 + strength * (ink - 255.0)).astype(np.uint8)
-    picture[np.isnan(share)] = _NOTHING
+    picture[np.isnan(share)] = _NO_VALUE
     return picture
 
 
@@ -167,7 +167,7 @@ def _sized(picture: _Picture, size: int) -> _Picture:
 
 
 def _with_contours(picture: _Picture, cut: _Cut, view: RingView) -> _Picture:
-    colour = _DROPPED if view.residual_image is None else _FITTED
+    colour = _REJECTED if view.residual_image is None else _FITTED
     arm = np.array([0.03 * cut.side, 0.0])
     cross = [view.centre_px + np.array([-tip, tip]) for tip in (arm, arm[::-1])]
     for lines, ink in ((view.curves, colour), (view.expected, _FITTED), (cross, _CENTRE)):

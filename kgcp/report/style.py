@@ -1,4 +1,4 @@
-"""Common parts of all figures: style, PNG bytes, and the places of the points in them."""
+"""Common parts of all figures: style, PNG bytes, and the positions of their points."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from kgcp.geometry.arrays import FloatArray, IndexArray
 
-# Okabe and Ito's palette, which colour-blind readers and grey prints can tell apart
+# Okabe and Ito's palette: distinct for colour-blind readers and in grey print
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 MARK_STEPS = 10_000  # of a picture's width and height
 _DPI = 180
@@ -92,7 +92,7 @@ def scatter(
 ) -> Points:
     """Draw measurements; those far from all others are drawn at the border, as triangles.
 
-    The others are those of `y`, or of `among` (m,) if several kinds share a panel.
+    The limits follow from `y`, or from `among` (m,) if several kinds share a panel.
     """
     low, high = _limits(y if among is None else among)
     shown = np.clip(y, low, high)

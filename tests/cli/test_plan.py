@@ -100,7 +100,7 @@ def test_the_figure_has_plain_numbers(flight: Path, heights: tuple[str, ...]) ->
     assert run(flight, "--plot", path, *options).exit_code == 0
     text = path.read_text(encoding="utf-8")
     assert "<!-- $" not in text, "no powers of ten"
-    for words in ("on the ground [m]", "size of a pixel on the ground [mm]", *heights):
+    for words in ("footprint [m]", "size of a pixel on the ground [mm]", *heights):
         assert f"<!-- {words} -->" in text
 
 

@@ -6,21 +6,21 @@
   const REACH_PX = 16;
 
   const element = (name, properties = {}, children = []) => {
-    const made = Object.assign(document.createElement(name), properties);
-    made.append(...children);
-    return made;
+    const node = Object.assign(document.createElement(name), properties);
+    node.append(...children);
+    return node;
   };
   const shape = (name, attributes) => {
-    const made = document.createElementNS("http://www.w3.org/2000/svg", name);
-    for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-    return made;
+    const node = document.createElementNS("http://www.w3.org/2000/svg", name);
+    for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
+    return node;
   };
   const print = (text) => (Number(text) === 0 ? "0" : text.replace("-", "−"));
   const number = (value, digits, unit) =>
     value === null ? "–" : `${print(value.toFixed(digits))} ${unit}`.trim();
 
   const values = (row) => {
-    const found = [
+    const entries = [
       ["target", columns.target[row]],
       ["time", columns.time[row] ?? "–"],
       ["distance", number(columns.distance_m[row], 3, "m")],
@@ -32,19 +32,19 @@
     ];
     for (const [name, label] of Object.entries(data.labels)) {
       const value = columns[name][row];
-      if (value !== null) found.push([label, print(Math.abs(value) < 1e-9 ? "0" : String(Number(value.toPrecision(4))))]);
+      if (value !== null) entries.push([label, print(Math.abs(value) < 1e-9 ? "0" : String(Number(value.toPrecision(4))))]);
     }
-    return found;
+    return entries;
   };
 
   // A close-up, with the fitted circles as lines that stay sharp.
   const drawing = (row) => {
-    const seen = data.closeups[row];
+    const closeup = data.closeups[row];
     const svg = shape("svg", { viewBox: `0 0 ${data.closeup_px} ${data.closeup_px}`, role: "img",
       "aria-label": `Close-up of ${columns.frame[row]}` });
-    svg.append(shape("image", { href: `data:image/jpeg;base64,${seen.jpeg}`,
+    svg.append(shape("image", { href: `data:image/jpeg;base64,${closeup.jpeg}`,
       width: data.closeup_px, height: data.closeup_px }));
-    for (const circle of seen.circles) {
+    for (const circle of closeup.circles) {
       if (circle.length === 2) {
         const [x, y] = circle;
         for (const kind of ["under", "ring"]) {
@@ -69,8 +69,8 @@
     const left = data.closeups[row]
       ? drawing(row)
       : element("p", { className: "note", textContent:
-          "This frame has no close-up: the page holds some, spread over the distances, and those " +
-          "of the largest residuals." });
+          "This frame has no close-up. The page contains some, spread over the distances, and those " +
+          "with the largest residuals." });
     dialog.querySelector("h2").textContent = columns.frame[row];
     dialog.querySelector(".halves").replaceChildren(left, list);
     dialog.dataset.row = row;
@@ -109,7 +109,7 @@
     plot.classList.add("live");
     plot.tabIndex = 0;
     plot.setAttribute("role", "group");
-    plot.setAttribute("aria-label", "Figure: the arrow keys go through its measurements");
+    plot.setAttribute("aria-label", "Figure: the arrow keys select its measurements");
     const order = rows.map((_, index) => index)
       .sort((a, b) => places[2 * a] - places[2 * b] || a - b);
     let current = -1;
@@ -169,10 +169,10 @@
   const gallery = document.getElementById("gallery");
   const near = (a, b) => columns.reference_distance_m[a] - columns.reference_distance_m[b];
   for (const row of Object.keys(data.closeups).map(Number).sort(near)) {
-    const seen = data.closeups[row];
+    const closeup = data.closeups[row];
     const text = `${columns.frame[row]}, ${number(columns.reference_distance_m[row], 1, "m")}`;
     const button = element("button", { type: "button", title: text }, [
-      element("img", { src: `data:image/jpeg;base64,${seen.jpeg}`, alt: "" }),
+      element("img", { src: `data:image/jpeg;base64,${closeup.jpeg}`, alt: "" }),
       element("span", { textContent: number(columns.reference_distance_m[row], 1, "m") }),
       element("span", { textContent: columns.frame[row] }),
     ]);
@@ -197,7 +197,7 @@
     return csv(lines);
   };
   const tableText = (table) => csv([...table.rows].map((row) =>
-    [...row.cells].map((one) => one.textContent.trim().replace(/\s+/g, " ").replaceAll("−", "-"))));
+    [...row.cells].map((field) => field.textContent.trim().replace(/\s+/g, " ").replaceAll("−", "-"))));
   for (const button of document.querySelectorAll("button[data-save]")) {
     const name = button.dataset.save;
     button.addEventListener("click", () => {
