@@ -165,7 +165,7 @@ def standardised_histogram(numbers: BiasNumbers) -> Picture:
         x = np.linspace(-5.0, 5.0, 201)
         normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
         axes.plot(x, normal, "--", color="black", linewidth=1.5, label="normal, sd 1")
-        axes.set_xlabel("error / reported standard deviation  (outer bins: all beyond)")
+        axes.set_xlabel("error / reported standard deviation  (outer bins: and beyond)")
         axes.set_ylabel("density")
         drawn = axes.get_legend_handles_labels()
         figure.legend(*drawn, loc="outside upper center", ncols=3, columnspacing=1.0)

@@ -99,7 +99,7 @@ def assess(numbers: BiasNumbers, reexposed: Sequence[Reexposed] = ()) -> Verdict
 
 def _accuracy(numbers: BiasNumbers) -> Finding:
     count = numbers.total.percent.count
-    parts = [f"{_rms(row)} {row.label} ({row.percent.count} of them)" for row in numbers.halves]
+    parts = [f"{row.label} {_rms(row)}" for row in numbers.halves]
     text = f"Distance error (RMS) over {counted(count, 'frame')}: {'; '.join(parts)}."
     if numbers.total.percent.rms > LIMITS.unusable_rms_percent:
         return Finding(
@@ -115,7 +115,8 @@ def _accuracy(numbers: BiasNumbers) -> Finding:
 
 
 def _rms(row: RangeRow) -> str:
-    return f"{row.percent.rms:.3f} % ({1000.0 * row.metres.rms:.0f} mm)"
+    frames = counted(row.percent.count, "frame")
+    return f"{row.percent.rms:.3f} % ({1000.0 * row.metres.rms:.0f} mm, {frames})"
 
 
 def _bias(numbers: BiasNumbers) -> Finding:
@@ -127,7 +128,7 @@ def _bias(numbers: BiasNumbers) -> Finding:
         text = f"No bias beyond {beyond}: the mean error is {_mean(numbers.total)}."
         return Finding(FlightGrade.GOOD, text, "error")
     sides = [(row, "long" if row.percent.mean > 0.0 else "short") for row in numbers.biased]
-    parts = [f"too {side} {row.label}, on average by {_mean(row)}" for row, side in sides]
+    parts = [f"too {side} ({row.label}), on average by {_mean(row)}" for row, side in sides]
     material = any(abs(row.percent.mean) >= LIMITS.mean_percent for row in numbers.biased)
     text = f"Biased: measured distances are {'; '.join(parts)}."
     return Finding(FlightGrade.LOOK if material else FlightGrade.GOOD, text, "error")

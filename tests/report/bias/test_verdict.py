@@ -174,7 +174,7 @@ def test_a_bias_of_the_far_half_alone_is_found(compare: Compare, study: Study) -
     far = zip(np.linspace(51, 100, 12), rng.normal(0.15, 0.05, 12), strict=True)
     numbers = bias_numbers(study(*(compare(d, e) for d, e in (*near, *far))))
     assert [row.label for row in numbers.biased] == ["50 m and more"]
-    assert "too long 50 m and more" in texts(numbers)
+    assert "too long (50 m and more)" in texts(numbers)
 
 
 def test_an_influence_of_exposure_is_named(compare: Compare, study: Study) -> None:
