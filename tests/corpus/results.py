@@ -163,19 +163,19 @@ CASES = (
     Case(
         "frames that are numbers",
         _retyped("frame", pa.array([7])),
-        "the column frame is of int64, not string",
+        "the column frame has the type int64, not string",
         command=_EXPORT,
     ),
     Case(
         "a frame that is nothing",
         _retyped("frame", pa.array([None], pa.string())),
-        "the column frame has gaps",
+        "the column frame has empty cells",
         command=_EXPORT,
     ),
     Case(
         "instances that are lists",
         _retyped("instance", pa.array([[1]])),
-        "the column instance is of list",
+        "the column instance has the type list",
         command=_EXPORT,
     ),
     Case("a table of another target", _table(target="B"), "has target 'B'", command=_EXPORT),

@@ -1,4 +1,4 @@
-"""Tables of a calibration: what was observed, the field's own shape, and the photographs."""
+"""Tables of a calibration: the observations, the adjusted field, and the photographs."""
 
 from __future__ import annotations
 
@@ -51,17 +51,17 @@ class FieldDisc:
 
     name: str
     nominal: FloatArray  # (3,)
-    adjusted: FloatArray | None  # (3,); None: no photograph tells where it is
-    cov: FloatArray | None  # (3, 3); None: likewise, or the points were fixed
+    adjusted: FloatArray | None  # (3,); None: no photograph determines it
+    cov: FloatArray | None  # (3, 3); None: likewise, or the points are fixed
     rays: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotoRow:
-    """What became of one photograph."""
+    """Result of one photograph."""
 
     photo: str
-    reason: str  # empty: it took part
+    reason: str  # empty: it was used
     detail: str
     pose: Pose | None
     cov: FloatArray | None  # (6, 6)
@@ -130,7 +130,7 @@ def observation_rows(
 ) -> Iterator[Row]:
     """Yield a row per disc and photograph."""
     names = calibration.field.names()
-    solution, known = calibration.solution, calibration.precision
+    solution, precision = calibration.solution, calibration.precision
     row = 0
     for view in calibration.views:
         measured = discs[view.photo]
@@ -143,7 +143,7 @@ def observation_rows(
                 measured.appearance[index],
                 "guided" if measured.is_guided[index] else calibration.field.named_by,
                 solution.residuals[row],
-                float(known.redundancy[row]),
+                float(precision.redundancy[row]),
                 float(solution.weights[row]),
                 bool(solution.is_used[row]),
                 calibration.eccentricity.perspective_px[row],
@@ -158,23 +158,23 @@ def field_discs(calibration: CameraCalibration) -> list[FieldDisc]:
     points, nominal = calibration.solution.estimate.points, calibration.field.points_m()
     observed = calibration.network.observations.point[calibration.solution.is_used]
     rays = np.bincount(observed, minlength=len(points)).tolist()
-    first = calibration.network.cameras.values.size
+    first_point = calibration.network.cameras.values.size
     inverse = calibration.precision.inverse * calibration.precision.variance_factor
     discs = []
     is_fixed = calibration.points_used is PointModel.FIXED
     for index, name in enumerate(calibration.field.names()):
         adjusted, cov = points[index] if is_fixed or rays[index] else None, None
         if not is_fixed and rays[index]:
-            own = slice(first + 3 * index, first + 3 * index + 3)
-            cov = inverse[own, own]
+            block = slice(first_point + 3 * index, first_point + 3 * index + 3)
+            cov = inverse[block, block]
         discs.append(FieldDisc(name, nominal[index], adjusted, cov, rays[index]))
     return discs
 
 
 def field_csv(discs: list[FieldDisc]) -> str:
-    """Return the field as text: name, x, y, z and their deviations [m].
+    """Return the field as CSV: name, x, y, z and their standard deviations [m].
 
-    Discs that no photograph tells of are left out: what was known beforehand is no result.
+    Discs that no photograph determines are left out: their nominal positions are not a result.
     """
     rows = []
     for disc in discs:
@@ -188,16 +188,16 @@ def field_csv(discs: list[FieldDisc]) -> str:
 def photo_rows(
     calibration: CameraCalibration, misses: tuple[PhotoMiss, ...], photos: tuple[str, ...]
 ) -> list[PhotoRow]:
-    """Return a row per photograph, in their order."""
-    solution, known = calibration.solution, calibration.precision
+    """Return a row per photograph, in the order of `photos`."""
+    solution, precision = calibration.solution, calibration.precision
     rows = {
         miss.photo: PhotoRow(miss.photo, miss.reason, miss.detail, None, None, 0, 0, None, None)
         for miss in misses
     }
     view_of = calibration.network.observations.view
     for index, view in enumerate(calibration.views):
-        mine = view_of == index
-        used = mine & solution.is_used
+        is_in_view = view_of == index
+        used = is_in_view & solution.is_used
         squares = np.sum(solution.residuals[used] ** 2, axis=1)
         estimate = solution.estimate
         pose = Pose(estimate.rotations[index], estimate.translations[index])
@@ -206,8 +206,8 @@ def photo_rows(
             "",
             "",
             pose,
-            known.variance_factor * known.pose_inverses[index],
-            int(np.count_nonzero(mine)),
+            precision.variance_factor * precision.pose_inverses[index],
+            int(np.count_nonzero(is_in_view)),
             int(np.count_nonzero(used)),
             float(np.sqrt(squares.mean())),
             math.degrees(math.acos(min(1.0, abs(float(pose.rotation[2, 2]))))),

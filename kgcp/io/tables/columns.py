@@ -1,6 +1,6 @@
-"""Columns of the tables that kgcp writes: name, type, and where in a record the value is.
+"""Columns of the tables that kgcp writes: name, type, and how a record gives the value.
 
-What each column means is said once, in docs/tables.md.
+Only docs/tables.md says what each column means.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Column(Generic[Record]):
     def of_vector(
         cls, names: Sequence[str], get: Callable[[Record], Sequence[float] | FloatArray | None]
     ) -> tuple[Column[Record], ...]:
-        """Return a column for each element of a vector, null where a record has none."""
+        """Return a column for each element of a vector; null where a record has no vector."""
 
         def element(index: int) -> Column[Record]:
             def cell(record: Record) -> float | None:
@@ -65,7 +65,7 @@ class Column(Generic[Record]):
     def of_sds(
         cls, names: Sequence[str], get: Callable[[Record], FloatArray | None]
     ) -> tuple[Column[Record], ...]:
-        """Return a column for the standard deviation along each of a covariance's first axes."""
+        """Return a column of standard deviations for each of a covariance's first axes."""
 
         def deviation(axis: int) -> Column[Record]:
             return cls(names[axis], NUMBER, lambda record: sd_cell(get(record), axis))
@@ -74,7 +74,7 @@ class Column(Generic[Record]):
 
 
 def row_of(columns: Iterable[Column[Record]], record: Record) -> Row:
-    """Return a record as a row: cells by the columns' names."""
+    """Return a record as a row: its cells by column name."""
     return {column.name: column.get(record) for column in columns}
 
 

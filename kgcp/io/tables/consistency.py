@@ -17,20 +17,24 @@ _AXES = ("along", "across", "up")
 
 
 CONSISTENCY_COLUMNS: tuple[Column[Discrepancy], ...] = (
-    Column("frame", TEXT, lambda found: found.frame),
-    Column("target", TEXT, lambda found: found.target),
-    Column("time", TIME, lambda found: time_cell(found.time_s)),
-    *Column[Discrepancy].of_vector([f"{axis}_m" for axis in _AXES], lambda found: found.offset_m),
-    *Column[Discrepancy].of_sds([f"sd_{axis}_m" for axis in _AXES], lambda found: found.cov_m2),
+    Column("frame", TEXT, lambda discrepancy: discrepancy.frame),
+    Column("target", TEXT, lambda discrepancy: discrepancy.target),
+    Column("time", TIME, lambda discrepancy: time_cell(discrepancy.time_s)),
     *Column[Discrepancy].of_vector(
-        [f"residual_{axis}_m" for axis in _AXES], lambda found: found.residual_m
+        [f"{axis}_m" for axis in _AXES], lambda discrepancy: discrepancy.offset_m
     ),
-    Column("outlier", BOOLEAN, lambda found: found.is_outlier),
+    *Column[Discrepancy].of_sds(
+        [f"sd_{axis}_m" for axis in _AXES], lambda discrepancy: discrepancy.cov_m2
+    ),
+    *Column[Discrepancy].of_vector(
+        [f"residual_{axis}_m" for axis in _AXES], lambda discrepancy: discrepancy.residual_m
+    ),
+    Column("outlier", BOOLEAN, lambda discrepancy: discrepancy.is_outlier),
 )
 
 
 def write_consistency(
-    folder: Path, found: Consistency, metadata: Mapping[str, str]
+    folder: Path, consistency: Consistency, metadata: Mapping[str, str]
 ) -> tuple[Path, Path]:
     """Write both files; return their paths.
 
@@ -40,15 +44,15 @@ def write_consistency(
         If they cannot be written.
     """
     summary, table = _paths(folder)
-    text = json.dumps(_summary(found), indent=2, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(_summary(consistency), indent=2, ensure_ascii=False, allow_nan=False)
     write_bytes(summary, f"{text}\n".encode())
-    rows = (row_of(CONSISTENCY_COLUMNS, each) for each in found.discrepancies)
+    rows = (row_of(CONSISTENCY_COLUMNS, discrepancy) for discrepancy in consistency.discrepancies)
     write_table(table, CONSISTENCY_COLUMNS, rows, metadata)
     return summary, table
 
 
 def remove_consistency(folder: Path) -> None:
-    """Remove both files of an earlier export: they are not of the points that are written now."""
+    """Remove both files of an earlier export, which do not describe the points written now."""
     for path in _paths(folder):
         remove(path)
 
@@ -57,18 +61,19 @@ def _paths(folder: Path) -> tuple[Path, Path]:
     return folder / "consistency.json", folder / "consistency.parquet"
 
 
-def _summary(found: Consistency) -> dict[str, object]:
-    estimate = found.estimate
+def _summary(consistency: Consistency) -> dict[str, object]:
+    estimate = consistency.estimate
     return {
-        "points": len(found.discrepancies),
-        "outliers": sum(each.is_outlier for each in found.discrepancies),
-        "rms_m": dict(zip(_AXES, rms_m(found), strict=True)),
+        "points": len(consistency.discrepancies),
+        "outliers": sum(discrepancy.is_outlier for discrepancy in consistency.discrepancies),
+        "rms_m": dict(zip(_AXES, rms_m(consistency), strict=True)),
         "corrections": [
-            {**asdict(each), "is_significant": each.is_significant} for each in estimate.corrections
+            {**asdict(correction), "is_significant": correction.is_significant}
+            for correction in estimate.corrections
         ],
         "chi2_before": estimate.chi2_before,
         "chi2_after": estimate.chi2_after,
         "degrees_of_freedom": estimate.degrees_of_freedom,
-        "correlation_s": found.correlation_s,
-        "advice": advice(found),
+        "correlation_s": consistency.correlation_s,
+        "advice": advice(consistency),
     }

@@ -1,4 +1,4 @@
-"""`detections.parquet`: rows from the results of frames, and back to records for what follows."""
+"""`detections.parquet`: rows from results of frames, and records from rows."""
 
 from __future__ import annotations
 
@@ -57,9 +57,9 @@ if TYPE_CHECKING:  # 0.3 s that `kgcp detect` does not need
 
 _Cells = Mapping[Hashable, object]
 _MEASURED = Status.MEASURED.value
-_LARGEST = 1e12  # of any number in a table, in its unit: beyond, as if it were infinite
-_MOST_PX = 1e6  # of the place of a target
-_LEAST_M, _MOST_M = 1e-3, 1e6  # of a distance
+_MAX_NUMBER = 1e12  # in the unit of its column; larger numbers are treated as infinite
+_MAX_COORDINATE_PX = 1e6  # absolute, of a target's centre
+_MIN_DISTANCE_M, _MAX_DISTANCE_M = 1e-3, 1e6
 _Part = TypeVar("_Part")
 _Record = tuple[FrameResult, Outcome, Shape]
 _Get = Callable[[_Record], Any]
@@ -70,11 +70,11 @@ def _frame(get: Callable[[FrameResult], object]) -> _Get:
 
 
 def _outcome(
-    of_observation: Callable[[Measurement], object], of_miss: Callable[[Miss], object]
+    of_measurement: Callable[[Measurement], object], of_miss: Callable[[Miss], object]
 ) -> _Get:
     def get(record: _Record) -> object:
         outcome = record[1]
-        return of_miss(outcome) if isinstance(outcome, Miss) else of_observation(outcome)
+        return of_miss(outcome) if isinstance(outcome, Miss) else of_measurement(outcome)
 
     return get
 
@@ -84,29 +84,29 @@ def _measured(get: Callable[[Measurement], object]) -> _Get:
 
 
 def _part(part: Callable[[Measurement], _Part | None], get: Callable[[_Part], object]) -> _Get:
-    """Get from a part of an observation; null where the method does not estimate it."""
+    """Get from a part of a measurement; null where the method does not estimate it."""
 
-    def of_observation(observation: Measurement) -> object:
-        value = part(observation)
+    def of_measurement(measurement: Measurement) -> object:
+        value = part(measurement)
         return None if value is None else get(value)
 
-    return _measured(of_observation)
+    return _measured(of_measurement)
 
 
 def _uncertainty(get: Callable[[Uncertainty], object]) -> _Get:
-    return _part(lambda seen: seen.uncertainty, get)
+    return _part(lambda measurement: measurement.uncertainty, get)
 
 
 def _common(get: Callable[[CommonUncertainty], object]) -> _Get:
-    return _part(lambda seen: seen.common, get)
+    return _part(lambda measurement: measurement.common, get)
 
 
 def _alternative(get: Callable[[Alternative], object]) -> _Get:
-    return _part(lambda seen: seen.alternative, get)
+    return _part(lambda measurement: measurement.alternative, get)
 
 
-def _image(seen: Measurement) -> CircleImage | None:
-    return seen.image
+def _image(measurement: Measurement) -> CircleImage | None:
+    return measurement.image
 
 
 @lru_cache(maxsize=2)
@@ -121,27 +121,29 @@ DETECTION_COLUMNS: tuple[Column[_Record], ...] = (
     Column("shape", TEXT, lambda record: record[2].value),
     Column("time", TIME, _frame(lambda result: time_cell(result.time_s))),
     Column("time_source", TEXT, _frame(lambda result: result.time_source.value)),
-    Column("instance", INTEGER, _outcome(lambda seen: seen.instance, lambda _: 0)),
+    Column("instance", INTEGER, _outcome(lambda measurement: measurement.instance, lambda _: 0)),
     Column("status", TEXT, _outcome(lambda _: _MEASURED, lambda miss: miss.reason.status.value)),
     Column("reason", TEXT, _outcome(lambda _: "", lambda miss: miss.reason.value)),
     Column("detail", TEXT, _outcome(lambda _: "", lambda miss: miss.detail)),
     Column("candidates", INTEGER, _outcome(lambda _: 0, lambda miss: miss.candidates)),
-    Column("guided", BOOLEAN, _outcome(lambda seen: seen.is_guided, lambda _: False)),
-    Column("scale_used", TEXT, _outcome(lambda seen: seen.ring, lambda _: "")),
-    *Column[_Record].of_vector(("x_px", "y_px"), _measured(lambda seen: seen.centre_px)),
+    Column("guided", BOOLEAN, _outcome(lambda measurement: measurement.is_guided, lambda _: False)),
+    Column("scale_used", TEXT, _outcome(lambda measurement: measurement.ring, lambda _: "")),
+    *Column[_Record].of_vector(
+        ("x_px", "y_px"), _measured(lambda measurement: measurement.centre_px)
+    ),
     *Column[_Record].of_sds(("sd_x_px", "sd_y_px"), _uncertainty(lambda sds: sds.centre_cov_px2)),
     Column("cov_xy_px2", NUMBER, _uncertainty(lambda sds: float(sds.centre_cov_px2[0, 1]))),
-    Column("distance_m", NUMBER, _measured(lambda seen: seen.pose.distance_m)),
+    Column("distance_m", NUMBER, _measured(lambda measurement: measurement.pose.distance_m)),
     Column("sd_distance_m", NUMBER, _uncertainty(lambda sds: sds.sd_distance_m)),
     *Column[_Record].of_vector(
-        ("tx_m", "ty_m", "tz_m"), _measured(lambda seen: seen.pose.translation_m)
+        ("tx_m", "ty_m", "tz_m"), _measured(lambda measurement: measurement.pose.translation_m)
     ),
     *Column[_Record].of_vector(
-        ("qw", "qx", "qy", "qz"), _measured(lambda seen: _quaternion(seen.pose))
+        ("qw", "qx", "qy", "qz"), _measured(lambda measurement: _quaternion(measurement.pose))
     ),
-    Column("roll_deg", NUMBER, _measured(lambda seen: seen.pose.roll_deg)),
-    Column("pitch_deg", NUMBER, _measured(lambda seen: seen.pose.pitch_deg)),
-    Column("heading_deg", NUMBER, _measured(lambda seen: seen.heading_deg)),
+    Column("roll_deg", NUMBER, _measured(lambda measurement: measurement.pose.roll_deg)),
+    Column("pitch_deg", NUMBER, _measured(lambda measurement: measurement.pose.pitch_deg)),
+    Column("heading_deg", NUMBER, _measured(lambda measurement: measurement.heading_deg)),
     Column("sd_roll_deg", NUMBER, _uncertainty(lambda sds: sds.sd_roll_deg)),
     Column("sd_pitch_deg", NUMBER, _uncertainty(lambda sds: sds.sd_pitch_deg)),
     Column("sd_heading_deg", NUMBER, _uncertainty(lambda sds: sds.sd_heading_deg)),
@@ -155,19 +157,23 @@ DETECTION_COLUMNS: tuple[Column[_Record], ...] = (
     Column("sd_common_direction_mrad", NUMBER, _common(lambda common: common.sd_direction_mrad)),
     Column("common_pose_cov", NUMBERS, _common(lambda common: matrix_cell(common.pose_cov))),
     *Column[_Record].of_vector(
-        ("ecc_x_px", "ecc_y_px"), _measured(lambda seen: seen.eccentricity_px)
+        ("ecc_x_px", "ecc_y_px"), _measured(lambda measurement: measurement.eccentricity_px)
     ),
     Column("moments", NUMBERS, _part(_image, lambda image: matrix_cell(image.moments))),
     Column("moments_cov", NUMBERS, _part(_image, lambda image: matrix_cell(image.cov))),
     Column(
-        "score", NUMBER, _outcome(lambda seen: finite_cell(seen.score), lambda miss: miss.score)
+        "score",
+        NUMBER,
+        _outcome(lambda measurement: finite_cell(measurement.score), lambda miss: miss.score),
     ),
-    Column("radius_px", NUMBER, _measured(lambda seen: seen.appearance.radius_px)),
-    Column("blur_px", NUMBER, _measured(lambda seen: seen.appearance.blur_px)),
-    Column("edge_shift_px", NUMBER, _measured(lambda seen: seen.appearance.edge_shift_px)),
-    Column("black", NUMBER, _measured(lambda seen: seen.appearance.black)),
-    Column("white", NUMBER, _measured(lambda seen: seen.appearance.white)),
-    Column("saturated", NUMBER, _measured(lambda seen: seen.appearance.saturated)),
+    Column("radius_px", NUMBER, _measured(lambda measurement: measurement.appearance.radius_px)),
+    Column("blur_px", NUMBER, _measured(lambda measurement: measurement.appearance.blur_px)),
+    Column(
+        "edge_shift_px", NUMBER, _measured(lambda measurement: measurement.appearance.edge_shift_px)
+    ),
+    Column("black", NUMBER, _measured(lambda measurement: measurement.appearance.black)),
+    Column("white", NUMBER, _measured(lambda measurement: measurement.appearance.white)),
+    Column("saturated", NUMBER, _measured(lambda measurement: measurement.appearance.saturated)),
     Column("exposure_time_s", NUMBER, _frame(lambda result: result.exposure.exposure_time_s)),
     Column("iso", NUMBER, _frame(lambda result: result.exposure.iso)),
     Column("f_number", NUMBER, _frame(lambda result: result.exposure.f_number)),
@@ -175,7 +181,7 @@ DETECTION_COLUMNS: tuple[Column[_Record], ...] = (
 
 
 def detection_rows(result: FrameResult, shapes: Mapping[str, Shape]) -> list[Row]:
-    """Return the rows of one frame, one per target and instance, by target and instance.
+    """Return the rows of one frame, one per target and instance, sorted by both.
 
     Parameters
     ----------
@@ -183,10 +189,10 @@ def detection_rows(result: FrameResult, shapes: Mapping[str, Shape]) -> list[Row
         Of all targets, by their names.
     """
 
-    def place(outcome: Outcome) -> tuple[str, int]:
+    def sort_key(outcome: Outcome) -> tuple[str, int]:
         return outcome.target, 0 if isinstance(outcome, Miss) else outcome.instance
 
-    outcomes = sorted(result.outcomes, key=place)
+    outcomes = sorted(result.outcomes, key=sort_key)
     return [
         row_of(DETECTION_COLUMNS, (result, outcome, shapes[outcome.target])) for outcome in outcomes
     ]
@@ -217,10 +223,10 @@ def read_detections(path: Path | str, *, status: str | None = None) -> pd.DataFr
 
 
 def read_attempts(path: Path, flight: Flight) -> list[Attempt]:
-    """Read the detections of a flight, without unreadable frames, in the frames' order.
+    """Read the detections of a flight, without unreadable frames, in the order of the frames.
 
-    A frame is numbered by its place among all frames, unreadable ones included, so that the
-    numbers do not depend on what was found.
+    Frames are numbered by their place among all frames, including unreadable ones, so that the
+    numbers do not depend on what was detected.
 
     Raises
     ------
@@ -230,15 +236,15 @@ def read_attempts(path: Path, flight: Flight) -> list[Attempt]:
     """
     table = read_detections(path)
     require_current(path, table, flight)
-    strange = sorted(set(table["target"]) - {target.name for target in flight.all_targets})
-    if strange:
+    unknown = sorted(set(table["target"]) - {target.name for target in flight.all_targets})
+    if unknown:
         raise KgcpError(
-            f"{path}: has target {strange[0]!r}, which flight.toml does not;"
+            f"{path}: has target {unknown[0]!r}, which flight.toml does not have;"
             " run 'kgcp detect' on this flight again"
         )
-    twice = table[table.duplicated(["frame", "target", "instance"])]
-    if len(twice):
-        frame, target = twice.iloc[0][["frame", "target"]]
+    duplicates = table[table.duplicated(["frame", "target", "instance"])]
+    if len(duplicates):
+        frame, target = duplicates.iloc[0][["frame", "target"]]
         raise KgcpError(
             f"{path}: has target {target!r} of {frame!r} twice; run 'kgcp detect' on this flight"
             " again"
@@ -253,10 +259,10 @@ def read_attempts(path: Path, flight: Flight) -> list[Attempt]:
 
 @dataclass(frozen=True, slots=True)
 class Outcomes:
-    """What became of the frames of a flight."""
+    """Summary of a table of detections."""
 
     frames: int
-    rows: int  # frames times targets, and further plates
+    rows: int  # frames times targets, plus further plates
     measured: int
     reasons: tuple[tuple[str, int], ...]  # why rows were not measured, the commonest first
     # times of the first and the last frame, Unix UTC [s]; None: no frame has one
@@ -268,7 +274,7 @@ class Outcomes:
 
 
 def read_outcomes(path: Path) -> Outcomes:
-    """Count what became of the frames in a table of detections.
+    """Summarise a table of detections.
 
     Raises
     ------
@@ -278,8 +284,8 @@ def read_outcomes(path: Path) -> Outcomes:
     table = read_detections(path)
     reasons = Counter(table["reason"][table["status"] != Status.MEASURED.value])
     times = table["time"].dropna()
-    off_px = table[["ecc_x_px", "ecc_y_px"]].dropna().to_numpy(np.float64)
-    lengths_px = np.hypot(*off_px.T)
+    eccentricities_px = table[["ecc_x_px", "ecc_y_px"]].dropna().to_numpy(np.float64)
+    lengths_px = np.hypot(*eccentricities_px.T)
     return Outcomes(
         frames=table["frame"].nunique(),
         rows=len(table),
@@ -294,29 +300,29 @@ def read_outcomes(path: Path) -> Outcomes:
 
 
 def read_settings(path: Path) -> DetectSettings:
-    """Read the settings that a table of detections was made with; the defaults for what it lacks.
+    """Read the settings of a table of detections; those that it lacks have their defaults.
 
     Raises
     ------
     KgcpError
-        If the table does not tell them in this version's words.
+        If they are not valid in this version of kgcp.
     """
     text = (pq.read_schema(path).metadata or {}).get(b"kgcp.settings", b"{}")
     try:
         values = json.loads(text)
-        known = {field.name for field in fields(DetectSettings)} & values.keys()
-        return DetectSettings(**{name: values[name] for name in known})
+        names = {field.name for field in fields(DetectSettings)} & values.keys()
+        return DetectSettings(**{name: values[name] for name in names})
     except (AttributeError, KgcpError, TypeError, ValueError, RecursionError) as error:
         raise KgcpError(
-            f"{path}: its settings are not of this version of kgcp ({error});"
+            f"{path}: its settings are not valid in this version of kgcp ({error});"
             " run 'kgcp detect' on this flight again"
         ) from error
 
 
 def read_learnt_imaging(path: Path) -> LearntImaging | None:
-    """Read what was learnt about a flight's camera; None if nothing, or by another version.
+    """Read what was learnt about a flight's camera; None if nothing, or written by another version.
 
-    It is shown only, and changes no result.
+    It is only displayed and changes no result.
     """
     text = (pq.read_schema(path).metadata or {}).get(f"kgcp.{LEARNT_IMAGING}".encode())
     try:
@@ -326,7 +332,7 @@ def read_learnt_imaging(path: Path) -> LearntImaging | None:
 
 
 def _attempt(row: _Cells, number: int) -> Attempt:
-    import pandas as pd  # which has read the row
+    import pandas as pd  # loaded already, by reading the row
 
     time = row["time"]
     time_s = time.timestamp() if isinstance(time, pd.Timestamp) else None
@@ -341,7 +347,7 @@ def _attempt(row: _Cells, number: int) -> Attempt:
 
 
 def _sighting(row: _Cells, number: int, time_s: float | None) -> Sighting:
-    sd_x, sd_y = (_deviation(row, name) for name in ("sd_x_px", "sd_y_px"))
+    sd_x, sd_y = (_sd(row, name) for name in ("sd_x_px", "sd_y_px"))
     cov_xy = _number(row, "cov_xy_px2")
     cov = None
     if sd_x is not None and sd_y is not None:
@@ -353,16 +359,21 @@ def _sighting(row: _Cells, number: int, time_s: float | None) -> Sighting:
         target=str(row["target"]),
         instance=int(str(row["instance"])),
         time_s=time_s,
-        centre_px=np.array([_known(row, name, -_MOST_PX, _MOST_PX) for name in ("x_px", "y_px")]),
+        centre_px=np.array(
+            [
+                _required(row, name, -_MAX_COORDINATE_PX, _MAX_COORDINATE_PX)
+                for name in ("x_px", "y_px")
+            ]
+        ),
         centre_cov_px2=cov,
-        distance_m=_known(row, "distance_m", _LEAST_M, _MOST_M),
-        sd_distance_m=_deviation(row, "sd_distance_m"),
+        distance_m=_required(row, "distance_m", _MIN_DISTANCE_M, _MAX_DISTANCE_M),
+        sd_distance_m=_sd(row, "sd_distance_m"),
         sd_common_distance_m=_number(row, "sd_common_distance_m"),
         pose=_pose(row),
-        pose_cov=_square(row, "pose_cov", 6),
+        pose_cov=_matrix(row, "pose_cov", 6),
         score=_number(row, "score"),
         ambiguity=_number(row, "ambiguity"),
-        common_pose_cov=_square(row, "common_pose_cov", 6),
+        common_pose_cov=_matrix(row, "common_pose_cov", 6),
         image=_circle_image(row),
     )
 
@@ -373,7 +384,7 @@ def _pose(row: _Cells) -> Pose | None:
     if None in translation or None in quaternion:
         return None
     components = np.array(quaternion, float)
-    if not np.linalg.norm(components) > 0.5:  # written ones have the norm 1
+    if not np.linalg.norm(components) > 0.5:  # kgcp writes unit quaternions
         raise KgcpError(
             f"detections of {row['frame']!r}: invalid quaternion (norm ≈ 0);"
             " run 'kgcp detect' on this flight again"
@@ -383,13 +394,13 @@ def _pose(row: _Cells) -> Pose | None:
 
 
 def _circle_image(row: _Cells) -> CircleImage | None:
-    moments, cov = row["moments"], _square(row, "moments_cov", 5)
+    moments, cov = row["moments"], _matrix(row, "moments_cov", 5)
     if cov is None or not isinstance(moments, np.ndarray) or moments.size != 5:
         return None
     return CircleImage(moments.astype(np.float64), cov)
 
 
-def _square(row: _Cells, name: str, size: int) -> FloatArray | None:
+def _matrix(row: _Cells, name: str, size: int) -> FloatArray | None:
     value = row[name]
     if not isinstance(value, np.ndarray) or value.size != size * size:
         return None
@@ -398,33 +409,33 @@ def _square(row: _Cells, name: str, size: int) -> FloatArray | None:
 
 def _number(row: _Cells, name: str) -> float | None:
     value = row[name]
-    return float(value) if isinstance(value, float) and abs(value) < _LARGEST else None
+    return float(value) if isinstance(value, float) and abs(value) < _MAX_NUMBER else None
 
 
-def _told(value: object) -> str:
+def _cell_text(value: object) -> str:
     """Describe a cell that is not a number."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "empty"
-    return f"{value!r}" if isinstance(value, float) else "no number"
+    return f"{value!r}" if isinstance(value, float) else "not a number"
 
 
-def _known(row: _Cells, name: str, least: float, most: float) -> float:
+def _required(row: _Cells, name: str, minimum: float, maximum: float) -> float:
     value = _number(row, name)
-    if value is None or not least <= value <= most:
-        raise _impossible(row, name)
+    if value is None or not minimum <= value <= maximum:
+        raise _invalid_cell(row, name)
     return value
 
 
-def _deviation(row: _Cells, name: str) -> float | None:
+def _sd(row: _Cells, name: str) -> float | None:
     """Return a standard deviation; None: the method does not estimate it."""
     value = _number(row, name)
     if value is not None and not value > 0.0:
-        raise _impossible(row, name)
+        raise _invalid_cell(row, name)
     return value
 
 
-def _impossible(row: _Cells, name: str) -> KgcpError:
+def _invalid_cell(row: _Cells, name: str) -> KgcpError:
     return KgcpError(
-        f"detections of {row['frame']!r}: {name} of a measured row is {_told(row[name])};"
+        f"detections of {row['frame']!r}: {name} of a measured row is {_cell_text(row[name])};"
         " run 'kgcp detect' on this flight again"
     )

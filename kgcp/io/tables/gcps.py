@@ -41,7 +41,7 @@ GCP_COLUMNS: tuple[Column[Gcp], ...] = (
 )
 
 
-_Compared = tuple[Comparison, Method]  # and by which method it was measured
+_Compared = tuple[Comparison, Method]  # and the method of its measurement
 _Get = Callable[[_Compared], object]
 
 
@@ -50,7 +50,9 @@ def _comparison(get: Callable[[Comparison], object]) -> _Get:
 
 
 def _sighting(get: Callable[[Sighting], object]) -> _Get:
-    return _comparison(lambda pair: pair.attempt.sighting and get(pair.attempt.sighting))
+    return _comparison(
+        lambda comparison: comparison.attempt.sighting and get(comparison.attempt.sighting)
+    )
 
 
 def _edges(get: Callable[[EdgeDistances], float]) -> _Get:
@@ -62,23 +64,29 @@ def _edges(get: Callable[[EdgeDistances], float]) -> _Get:
 
 
 def _exposure(name: str) -> _Get:
-    return _comparison(lambda pair: getattr(pair.attempt.exposure, name))
+    return _comparison(lambda comparison: getattr(comparison.attempt.exposure, name))
 
 
 BIAS_COLUMNS: tuple[Column[_Compared], ...] = (
-    Column("frame", TEXT, _comparison(lambda pair: pair.attempt.frame)),
-    Column("target", TEXT, _comparison(lambda pair: pair.attempt.target)),
-    Column("time", TIME, _comparison(lambda pair: time_cell(pair.attempt.time_s))),
-    Column("distance_m", NUMBER, _sighting(lambda seen: seen.distance_m)),
-    Column("sd_distance_m", NUMBER, _sighting(lambda seen: seen.sd_distance_m)),
+    Column("frame", TEXT, _comparison(lambda comparison: comparison.attempt.frame)),
+    Column("target", TEXT, _comparison(lambda comparison: comparison.attempt.target)),
+    Column("time", TIME, _comparison(lambda comparison: time_cell(comparison.attempt.time_s))),
+    Column("distance_m", NUMBER, _sighting(lambda sighting: sighting.distance_m)),
+    Column("sd_distance_m", NUMBER, _sighting(lambda sighting: sighting.sd_distance_m)),
     Column("one_edge_distance_m", NUMBER, _edges(lambda edges: edges.by_outer_edge_m)),
     Column("two_edge_distance_m", NUMBER, _edges(lambda edges: edges.by_both_edges_m)),
-    Column("reference_distance_m", NUMBER, _comparison(lambda pair: pair.reference_distance_m)),
     Column(
-        "sd_reference_distance_m", NUMBER, _comparison(lambda pair: pair.sds and pair.sds.total_m)
+        "reference_distance_m",
+        NUMBER,
+        _comparison(lambda comparison: comparison.reference_distance_m),
     ),
-    Column("residual_m", NUMBER, _comparison(lambda pair: pair.residual_m)),
-    Column("residual_percent", NUMBER, _comparison(lambda pair: pair.residual_percent)),
+    Column(
+        "sd_reference_distance_m",
+        NUMBER,
+        _comparison(lambda comparison: comparison.sds and comparison.sds.total_m),
+    ),
+    Column("residual_m", NUMBER, _comparison(lambda comparison: comparison.residual_m)),
+    Column("residual_percent", NUMBER, _comparison(lambda comparison: comparison.residual_percent)),
     *(Column(field.name, NUMBER, _exposure(field.name)) for field in fields(Exposure)),
 )
 
@@ -88,6 +96,12 @@ def gcp_row(point: Gcp) -> Row:
     return row_of(GCP_COLUMNS, point)
 
 
-def bias_row(measured: Comparison, method: Method) -> Row:
-    """Return the row of one comparison that has a residual, measured by some method."""
-    return row_of(BIAS_COLUMNS, (measured, method))
+def bias_row(comparison: Comparison, method: Method) -> Row:
+    """Return the row of one comparison that has a residual.
+
+    Parameters
+    ----------
+    method : Method
+        How the distance was measured.
+    """
+    return row_of(BIAS_COLUMNS, (comparison, method))

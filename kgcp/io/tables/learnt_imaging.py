@@ -1,4 +1,4 @@
-"""What a flight has taught of its camera, as metadata of the table of detections."""
+"""What was learnt from a flight about its camera, as metadata of the table of detections."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from kgcp.measurement.records import ToneBase
 from kgcp.quality.learnt_imaging import LearntImaging
 
 LEARNT_IMAGING = "learnt_imaging"
-"""Its key."""
+"""Key of the metadata."""
 
 _DIGITS = 6
 
 
 def learnt_text(learnt: LearntImaging) -> str:
-    """Return it as JSON; null stands for what is not known."""
+    """Return what was learnt as JSON; unknown values are null."""
     return json.dumps(
         {
             "tone_base": None if learnt.base is None else learnt.base.value,
@@ -42,7 +42,7 @@ def learnt_from_text(text: str) -> LearntImaging:
     Raises
     ------
     ValueError, KeyError, TypeError
-        If it is anything else.
+        If the text is anything else.
     """
     parts = json.loads(text)
     return LearntImaging(
@@ -50,7 +50,7 @@ def learnt_from_text(text: str) -> LearntImaging:
         advantages={ToneBase(base): each for base, each in parts["advantages"].items()},
         measurements=parts["measurements"],
         overruled=parts["overruled"],
-        kept_own_base=parts.get("kept_other", 0),  # tables of before have none
+        kept_own_base=parts.get("kept_other", 0),  # older tables lack it
         grey=np.array(parts["grey"], dtype=np.float64),
         light=np.array(parts["light"], dtype=np.float64),
         sharpening=np.array(parts["sharpening"], dtype=np.float64),

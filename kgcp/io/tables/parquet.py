@@ -26,21 +26,21 @@ _ARROW_TYPES = {
     ColumnType.TIME: pa.timestamp("us", tz="UTC"),
     ColumnType.NUMBERS: pa.list_(pa.float64()),
 }
-_KEYS = ("frame", "target", "instance", "status")  # no row is without
-_ROWS_PER_GROUP = 4096  # of the file's row groups: this many are in memory at once
+_KEYS = ("frame", "target", "instance", "status")  # columns without null
+_ROWS_PER_GROUP = 4096  # as many rows are in memory at once
 
 
 def write_table(
     path: Path, columns: Sequence[Column[Any]], rows: Iterable[Row], metadata: Mapping[str, str]
 ) -> None:
-    """Write rows as Parquet under `path`, by a temporary name and a rename.
+    """Write rows as Parquet to a temporary file, and rename that to `path`.
 
     Parameters
     ----------
     columns : sequence of Column
         The declared columns; a row that lacks one or has others is a programming error.
     rows : iterable of mapping
-        Column name to value; None is null. Only a part of them is in memory at a time.
+        Column name to value; None is null. Only one row group is in memory at a time.
 
     Raises
     ------
@@ -81,7 +81,8 @@ def read_table(path: Path, columns: Sequence[Column[Any]]) -> pd.DataFrame:
     Raises
     ------
     KgcpError
-        If the file is missing, not Parquet, lacks declared columns, or has others in their place.
+        If the file is missing, not Parquet, lacks declared columns, or has them with another
+        type, twice, or with null in a key.
     """
     if not is_file(path):
         raise KgcpError(f"{path}: does not exist; run the command that writes it first")
@@ -101,13 +102,19 @@ def read_table(path: Path, columns: Sequence[Column[Any]]) -> pd.DataFrame:
 
 
 def _check_columns(path: Path, table: pa.Table, columns: Sequence[Column[Any]]) -> None:
-    """Refuse columns of other types than are written, and gaps among keys."""
+    """Refuse columns that have another type than declared, occur twice, or lack keys."""
     for column in columns:
-        places = table.schema.get_all_field_indices(column.name)
-        found = table.schema.field(places[0]).type
-        wanted = _ARROW_TYPES[column.type]
-        if len(places) > 1 or found != wanted:
-            problem = "occurs twice" if len(places) > 1 else f"is of {found}, not {wanted}"
+        indices = table.schema.get_all_field_indices(column.name)
+        actual_type = table.schema.field(indices[0]).type
+        declared_type = _ARROW_TYPES[column.type]
+        if len(indices) > 1 or actual_type != declared_type:
+            problem = (
+                "occurs twice"
+                if len(indices) > 1
+                else f"has the type {actual_type}, not {declared_type}"
+            )
             raise KgcpError(f"{path}: the column {column.name} {problem}; remake it with kgcp")
         if column.name in _KEYS and table.column(column.name).null_count:
-            raise KgcpError(f"{path}: the column {column.name} has gaps; remake it with kgcp")
+            raise KgcpError(
+                f"{path}: the column {column.name} has empty cells; remake it with kgcp"
+            )

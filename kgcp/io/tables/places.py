@@ -28,7 +28,7 @@ _MOMENTS = ("x_px", "y_px", "s_xx_px2", "s_xy_px2", "s_yy_px2")
 
 @dataclass(frozen=True, slots=True)
 class PlaceResidual:
-    """One frame's share in the place of a target."""
+    """Residuals of one frame in the position of a target."""
 
     placed: PlacedTarget
     row: int
@@ -85,22 +85,29 @@ def residual_rows(placed: Sequence[PlacedTarget]) -> Iterator[Row]:
 
 
 def places_csv(placed: Sequence[PlacedTarget], *, is_geographic: bool) -> str:
-    """Return places as text, in the columns of a list of points of other programs.
+    """Return places as CSV, in the columns of other programs' point lists.
 
     Parameters
     ----------
     is_geographic : bool
         Whether x and y are degrees, which need more decimals than metres.
     """
-    normal = [f"normal_{a}" for a in _AXES]
-    columns = ["name", *_AXES, *(f"sd_{a}" for a in _AXES), "diameter_m", "sd_diameter_m", *normal]
+    normal_columns = [f"normal_{a}" for a in _AXES]
+    columns = [
+        "name",
+        *_AXES,
+        *(f"sd_{a}" for a in _AXES),
+        "diameter_m",
+        "sd_diameter_m",
+        *normal_columns,
+    ]
     rows = []
     for target in placed:
         x, y, z = target.position_map.tolist()
-        across = DEGREE_DECIMALS if is_geographic else _METRE_DECIMALS
-        position = f"{x:.{across}f}", f"{y:.{across}f}", f"{z:.{_METRE_DECIMALS}f}"
+        xy_decimals = DEGREE_DECIMALS if is_geographic else _METRE_DECIMALS
+        position = f"{x:.{xy_decimals}f}", f"{y:.{xy_decimals}f}", f"{z:.{_METRE_DECIMALS}f}"
         sds = (f"{value:.6f}" for value in target.sds[:3].tolist())
         size = (f"{target.diameter_m:.6f}", f"{target.sd_diameter_m:.6f}")
-        along = (f"{value:.7f}" for value in target.normal.tolist())
-        rows.append([target.target, *position, *sds, *size, *along])
+        normal = (f"{value:.7f}" for value in target.normal.tolist())
+        rows.append([target.target, *position, *sds, *size, *normal])
     return csv_text(columns, rows)

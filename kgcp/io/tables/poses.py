@@ -40,7 +40,7 @@ class MapPose:
 
     @property
     def sd_angle_deg(self) -> float | None:
-        """Standard deviation of an angle, as the root of the three's mean square [deg]."""
+        """Standard deviation of an angle: the root mean square of all three [deg]."""
         return None if self.cov is None else _sd_angle_deg(self.cov)
 
 
@@ -49,21 +49,21 @@ def _sd_angle_deg(cov: FloatArray) -> float:
 
 
 def on_map(poses: Sequence[FramePose], local_frame: LocalFrame) -> list[MapPose]:
-    """Bring poses from the ENU frame to the map."""
+    """Transform poses from the ENU frame to the map."""
     rows = []
-    for each in poses:
-        if each.pose is None or each.cov is None:
-            rows.append(MapPose(each, None, None, None))
+    for frame_pose in poses:
+        if frame_pose.pose is None or frame_pose.cov is None:
+            rows.append(MapPose(frame_pose, None, None, None))
             continue
-        map_from_enu = local_frame.grid_rotation(each.pose.centre_m).T
-        rotation = map_from_enu @ each.pose.world_from_camera @ CAMERA_FROM_PHOTO
-        turn = np.kron(np.eye(2), map_from_enu)
+        map_from_enu = local_frame.grid_rotation(frame_pose.pose.centre_m).T
+        rotation = map_from_enu @ frame_pose.pose.world_from_camera @ CAMERA_FROM_PHOTO
+        block_rotation = np.kron(np.eye(2), map_from_enu)
         rows.append(
             MapPose(
-                each,
-                local_frame.map_from_enu(each.pose.centre_m[None])[0],
+                frame_pose,
+                local_frame.map_from_enu(frame_pose.pose.centre_m[None])[0],
                 opk_from_rotation(rotation[None])[0],
-                turn @ each.cov @ turn.T,
+                block_rotation @ frame_pose.cov @ block_rotation.T,
             )
         )
     return rows
@@ -108,12 +108,12 @@ POSE_COLUMNS: tuple[Column[MapPose], ...] = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseResidual:
-    """One target's share in the pose of a frame."""
+    """Residuals of one target in the pose of a frame."""
 
     frame: str
     target: str
     is_used: bool
-    residual: FloatArray  # (3,): place [px], and logarithm of the distance
+    residual: FloatArray  # (3,): x and y [px], and logarithm of the distance
     chi2: float
 
 
@@ -134,7 +134,7 @@ POSE_RESIDUAL_COLUMNS: tuple[Column[PoseResidual], ...] = (
 
 
 def pose_residuals(poses: Sequence[FramePose]) -> Iterator[PoseResidual]:
-    """Yield every target of the frames that three targets or more have oriented."""
+    """Yield the residuals of every target, in frames that three or more targets orient."""
     for pose in poses:
         if pose.residuals is None or pose.chi2 is None:
             continue
@@ -153,7 +153,7 @@ def pose_csv_cells(
     *,
     is_geographic: bool = False,
 ) -> list[str]:
-    """Return a pose in the columns of reference poses.
+    """Return a pose as cells, in the columns of reference poses.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def poses_csv(rows: Sequence[MapPose], *, is_geographic: bool) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OwnFramePose:
-    """A frame's pose relative to the device or field that it shows, and the rest of its row."""
+    """A frame's pose relative to the device or field that it shows, and further cells."""
 
     frame: str
     pose: CameraPose
@@ -203,7 +203,7 @@ class OwnFramePose:
 
 
 def own_frame_poses_csv(rows: Iterable[OwnFramePose], more: Sequence[str]) -> str:
-    """Return poses in the columns of reference poses, with `focal_scale` and some more columns."""
+    """Return poses in the columns of reference poses, then `focal_scale` and further columns."""
     table = []
     for row in rows:
         pose = row.pose

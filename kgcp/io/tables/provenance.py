@@ -1,8 +1,8 @@
-"""What a table says about its making, and `run.json`, which says it of a run.
+"""Provenance of tables, in their metadata, and of runs, in `run.json`.
 
-The metadata of a table hold a digest of each part that it depends on, so that two tables, or a
+The metadata of a table hold a digest of each input that it depends on, so that two tables, or a
 table and a flight, can be compared. The table of detections also holds the values of the keys of
-flight.toml that it depends on, so that a change can be named; tables made from it repeat that.
+flight.toml that it depends on, so that a change can be named. Tables made from it repeat them.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from kgcp.targets.layout import Ring, Target
 from kgcp.targets.plain import PlainTarget
 
 TARGET_TABLE = "[[target]]"
-"""What the keys of targets begin with, among those that detections depend on."""
+"""Prefix of the keys of targets among the inputs of detections."""
 
-_SCALE_DIGITS = 12  # of a replica, which is kept as diameters
+_SCALE_DIGITS = 12  # significant; the scale of a replica is computed from diameters
 _DIGITS = 32  # of a digest: 128 bits
 _PREFIX = b"kgcp."  # of the keys of Parquet's metadata
 
@@ -63,9 +63,9 @@ def detections_provenance(
     frame_sizes : mapping of str to int
         Bytes of the file of every frame; None: missing.
     times : FrameTimes
-        Entries of no frame are passed over.
+        Entries that belong to no frame are ignored.
     frame_patterns : sequence of str
-        Which frames the table has; empty: all.
+        They select the frames of the table; empty: all.
     places : Path, optional
         File of static targets that were marked by hand.
     """
@@ -105,7 +105,7 @@ def derived_provenance(
     detections : Path
         Their table, whose own metadata are repeated under `detections`.
     choices : mapping
-        What else was asked for, by name.
+        Further choices of the user, by name.
     has_reference : bool
         Whether reference poses were used.
     """
@@ -146,7 +146,7 @@ def derived_provenance(
 
 
 def detection_inputs(flight: Flight) -> dict[str, object]:
-    """Return what detections depend on in flight.toml, and in a calibration file that it names.
+    """Return the values in flight.toml and its calibration file that detections depend on.
 
     Returns
     -------
@@ -176,7 +176,7 @@ def detection_inputs(flight: Flight) -> dict[str, object]:
 
 
 def _plain_table(target: PlainTarget) -> dict[str, object]:
-    """Return what flight.toml says of a target without a code; its place tells it from others."""
+    """Return the keys of a target without a code, which its position distinguishes from others."""
     outer_m, *inner_m = target.diameters_m
     return {
         "shape": target.shape.value,
@@ -193,7 +193,7 @@ def _plain_table(target: PlainTarget) -> dict[str, object]:
 
 
 def _target_table(target: Target, ring: Ring) -> dict[str, object]:
-    """Return what flight.toml says of a plate, or of a replica on it."""
+    """Return the keys of a plate, or of a replica on it."""
     if ring is target.ring:
         table = {field.name: getattr(ring, field.name) for field in fields(Ring)}
         del table["name"]
@@ -211,15 +211,15 @@ def digested_times(
 ) -> list[tuple[object, ...]]:
     """Return each frame's time as known before the frame is read: microseconds, or the source.
 
-    With a rolling shutter, how fast the camera turns at that time is known, too.
+    With a rolling shutter, the rotation at that time is added where it is known.
     """
-    otherwise = TimeSource.EXIF if flight.may_use_exif_times else TimeSource.NONE
+    fallback = TimeSource.EXIF if flight.may_use_exif_times else TimeSource.NONE
     rotations = times.rotation if flight.camera.readout_s else {}
     digested: list[tuple[object, ...]] = []
     for frame in frames:
         time_s, rotation = times.time_s.get(frame), rotations.get(frame)
-        known = (frame, otherwise if time_s is None else round(1e6 * time_s))
-        digested.append(known if rotation is None else (*known, astuple(rotation)))
+        entry = (frame, fallback if time_s is None else round(1e6 * time_s))
+        digested.append(entry if rotation is None else (*entry, astuple(rotation)))
     return digested
 
 
@@ -237,8 +237,8 @@ def _digests(parts: Mapping[str, object]) -> str:
 
 
 def digest(value: object) -> str:
-    """Return 32 hexadecimal digits that tell plain values from all others."""
-    text = json.dumps(value, sort_keys=True, default=str)  # dates
+    """Return a digest of plain values: 32 hexadecimal digits."""
+    text = json.dumps(value, sort_keys=True, default=str)  # `str` is for dates
     return hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]
 
 
@@ -256,7 +256,7 @@ def versions() -> dict[str, str]:
         "kgcp": __version__,
         "python": platform.python_version(),
         "numpy": np.__version__,
-        "scipy": version("scipy"),  # of the package: not every process loads it
+        "scipy": version("scipy"),  # from the metadata: not every process imports scipy
         "opencv": cv2.__version__,
         "numba": version("numba"),
         "pillow": PIL.__version__,
@@ -272,10 +272,10 @@ def write_run_record(path: Path, record: Mapping[str, object]) -> None:
     KgcpError
         If it cannot be written.
     """
-    whole = {
+    full_record = {
         **record,
         "versions": versions(),
         "host": {"cores": os.cpu_count(), "system": platform.platform()},
         "peak_memory_mb": peak_memory_mb(),
     }
-    write_bytes(path, f"{json.dumps(whole, indent=1)}\n".encode())
+    write_bytes(path, f"{json.dumps(full_record, indent=1)}\n".encode())

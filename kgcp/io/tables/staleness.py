@@ -32,17 +32,18 @@ from kgcp.settings import DetectSettings
 if TYPE_CHECKING:  # 0.3 s that `kgcp detect` does not need
     import pandas as pd
 
-_SAME_TIME_S = 2e-6  # tables hold microseconds
-_SAME_SHIFT_S = 1e-3  # spread of differences that are called one shift
-_LONGEST_VALUE = 40  # characters of a value that is shown
-_MOST_SHOWN = 6  # changes that are named one by one
-_CAMERA_KEYS = {f"[camera] {field.name}" for field in fields(Camera)}  # every table has them
+_TIME_TOLERANCE_S = 2e-6  # as tables hold microseconds
+_SHIFT_TOLERANCE_S = 1e-3  # range of time changes that are reported as one shift
+_MAX_VALUE_LENGTH = 40  # characters; longer values are not shown
+_MAX_CHANGES_SHOWN = 6  # the others are only counted
+# A table that lacks one of them is older than that key.
+_CAMERA_KEYS = {f"[camera] {field.name}" for field in fields(Camera)}
 
 
 def refuse_to_replace_whole(path: Path) -> None:
-    """Refuse to replace a table of all frames by one of some: that of all took the longer work.
+    """Refuse to replace a table of all frames by one of some, which would waste longer work.
 
-    A table of some frames, and what is no table, may be replaced.
+    A table of some frames may be replaced, and so may a file that is no table.
 
     Raises
     ------
@@ -51,7 +52,7 @@ def refuse_to_replace_whole(path: Path) -> None:
     """
     try:
         metadata = pq.read_schema(path).metadata or {}
-    except (OSError, pa.ArrowException):  # there is none, or it is damaged
+    except (OSError, pa.ArrowException):  # no table, or a damaged one
         return
     if b"kgcp.inputs" in metadata and b"kgcp.choice" not in metadata:
         raise KgcpError(
@@ -64,13 +65,13 @@ def refuse_to_replace_whole(path: Path) -> None:
 def require_current(path: Path, table: pd.DataFrame, flight: Flight) -> None:
     """Refuse detections that were made from another camera, other targets, times or frames.
 
-    What later commands read anew, as trajectory, lever arm, CRS and reference poses, may differ. A
-    table that does not say what it was made from passes: kgcp has not written it.
+    Inputs that later commands read anew may differ: trajectory, lever arm, CRS, reference poses. A
+    table that does not state its inputs passes: kgcp did not write it.
 
     Parameters
     ----------
     path : Path
-        The table's file, whose metadata say what it was made from.
+        File of the table, whose metadata state its inputs.
 
     Raises
     ------
@@ -82,36 +83,40 @@ def require_current(path: Path, table: pd.DataFrame, flight: Flight) -> None:
     if not inputs:
         return
     digests = _json(metadata, b"kgcp.digests")
-    today = _frames_of_today(flight)
-    chosen = _chosen(today, metadata)
+    frames_now = _frames_now(flight)
+    chosen = _chosen_frames(frames_now, metadata)
     changes = [
         *_changed_keys(inputs, detection_inputs(flight)),
-        *_changed_times(table, flight, digests, None if chosen == today else today),
+        *_changed_times(table, flight, digests, None if chosen == frames_now else frames_now),
         *_changed_frames(table, flight, digests, chosen),
     ]
     if changes:
-        more = len(changes) - _MOST_SHOWN
-        listed = ", ".join([*changes[:_MOST_SHOWN], *([f"{more} more"] if more > 0 else [])])
+        not_shown = len(changes) - _MAX_CHANGES_SHOWN
+        listed = ", ".join(
+            [*changes[:_MAX_CHANGES_SHOWN], *([f"{not_shown} more"] if not_shown > 0 else [])]
+        )
         raise KgcpError(
             f"{path}: does not belong to this flight any more; changed since 'kgcp detect':"
             f" {listed}; {_remedy(path, flight, _json(metadata, b'kgcp.settings'))}"
         )
 
 
-def _frames_of_today(flight: Flight) -> list[str] | None:
-    """Return the frames in the flight's folder; None: moved to an archive, or in a store."""
+def _frames_now(flight: Flight) -> list[str] | None:
+    """Return the frames in the flight's folder; None: they are in an archive or a store."""
     try:
         return list_frames(flight.frames_folder)
     except KgcpError:
         return None
 
 
-def _chosen(today: list[str] | None, metadata: Mapping[bytes, bytes]) -> list[str] | None:
-    """Return the frames that the table would have if it were made today."""
+def _chosen_frames(
+    frames_now: list[str] | None, metadata: Mapping[bytes, bytes]
+) -> list[str] | None:
+    """Return the frames that the table would have if it were made now."""
     patterns = _json(metadata, b"kgcp.choice").get("frames")
-    if today is None or not isinstance(patterns, list) or not patterns:
-        return today
-    return [frame for frame in today if is_chosen(frame, [*map(str, patterns)])]
+    if frames_now is None or not isinstance(patterns, list) or not patterns:
+        return frames_now
+    return [frame for frame in frames_now if is_chosen(frame, [*map(str, patterns)])]
 
 
 def _json(metadata: Mapping[bytes, bytes], key: bytes) -> dict[str, object]:
@@ -125,8 +130,8 @@ def _json(metadata: Mapping[bytes, bytes], key: bytes) -> dict[str, object]:
 def _remedy(path: Path, flight: Flight, settings: Mapping[str, object]) -> str:
     """Return the command to repeat, with the settings that were not the default ones."""
     folder = str(flight.folder)
-    named = f'"{folder}"' if " " in folder else folder
-    remedy = f"repeat 'kgcp detect {named}'"
+    quoted = f'"{folder}"' if " " in folder else folder
+    remedy = f"repeat 'kgcp detect {quoted}'"
     if path.parent.parent.resolve() != flight.folder.resolve():
         remedy = f"{remedy} with {path.parent} as the results folder"
     defaults = asdict(DetectSettings())
@@ -135,14 +140,14 @@ def _remedy(path: Path, flight: Flight, settings: Mapping[str, object]) -> str:
 
 
 def _changed_keys(then: Mapping[str, object], now: Mapping[str, object]) -> Iterator[str]:
-    """Yield the keys of flight.toml that have other values now, with both where they are short."""
+    """Yield the keys of flight.toml whose values have changed; short values are shown."""
     now = json.loads(json.dumps(now))
     targets_then, targets_now = _targets(then), _targets(now)
     yield from (f"{target} is new" for target in targets_now if target not in targets_then)
     yield from (f"{target} is gone" for target in targets_then if target not in targets_now)
-    kept = {target for target in targets_then if target in targets_now}
+    common = {target for target in targets_then if target in targets_now}
     for key in (*now, *(key for key in then if key not in now)):
-        is_of_both = not key.startswith(TARGET_TABLE) or _target(key) in kept
+        is_of_both = not key.startswith(TARGET_TABLE) or _target(key) in common
         is_of_later_version = key in _CAMERA_KEYS and key not in then
         if is_of_both and not is_of_later_version and then.get(key) != now.get(key):
             yield f"{key}{_from_to(then.get(key), now.get(key))}"
@@ -159,15 +164,15 @@ def _target(key: str) -> str:
 
 
 def _from_to(then: object, now: object) -> str:
-    shown = [_shown(then), _shown(now)]
-    return f" ({' → '.join(shown)})" if max(map(len, shown)) <= _LONGEST_VALUE else ""
+    shown = [_value_text(then), _value_text(now)]
+    return f" ({' → '.join(shown)})" if max(map(len, shown)) <= _MAX_VALUE_LENGTH else ""
 
 
-def _shown(value: object) -> str:
+def _value_text(value: object) -> str:
     if value is None:
         return "none"
     if isinstance(value, list):
-        return f"[{', '.join(map(_shown, value))}]"
+        return f"[{', '.join(map(_value_text, value))}]"
     return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
@@ -177,9 +182,10 @@ def _changed_times(
     digests: Mapping[str, object],
     all_frames: list[str] | None,
 ) -> Iterator[str]:
-    """Yield that frames have other times now, or none, if so.
+    """Yield a change if frames have other times now, or no longer have one.
 
-    A table of chosen frames has not `all_frames`, by which a times file without names tells them.
+    A times file without names can only be assigned to `all_frames`; a table of chosen frames does
+    not have them.
     """
     frames = table.drop_duplicates("frame")
     names = frames["frame"].to_list()
@@ -193,22 +199,22 @@ def _changed_times(
     if flight.may_use_exif_times:
         is_exif = (frames["time_source"] == TimeSource.EXIF.value).to_numpy()
         now_s = np.where(np.isnan(now_s) & is_exif, then_s, now_s)
-    is_same = (np.abs(now_s - then_s) <= _SAME_TIME_S) | (np.isnan(now_s) & np.isnan(then_s))
+    is_same = (np.abs(now_s - then_s) <= _TIME_TOLERANCE_S) | (np.isnan(now_s) & np.isnan(then_s))
     changed = np.flatnonzero(~is_same)
     if not changed.size:
         yield "[frames] times"
         return
-    of_all = f"[frames] times of {len(changed)} of {len(frames)} frames"
+    changed_times = f"[frames] times of {len(changed)} of {len(frames)} frames"
     shifts_s = (now_s - then_s)[changed]
-    if np.ptp(shifts_s) <= _SAME_SHIFT_S:
-        yield f"{of_all} (by {np.median(shifts_s):+.6g} s)"
+    if np.ptp(shifts_s) <= _SHIFT_TOLERANCE_S:
+        yield f"{changed_times} (by {np.median(shifts_s):+.6g} s)"
     else:
         first = changed[0]
-        was, now = (_shown_time(float(time_s[first])) for time_s in (then_s, now_s))
-        yield f"{of_all} ({names[first]}: {was} → {now})"
+        was, now = (_time_text(float(time_s[first])) for time_s in (then_s, now_s))
+        yield f"{changed_times} ({names[first]}: {was} → {now})"
 
 
-def _shown_time(time_s: float) -> str:
+def _time_text(time_s: float) -> str:
     return "none" if np.isnan(time_s) else format_time(time_s)
 
 
@@ -223,7 +229,7 @@ def _unix_s(times: pd.Series) -> FloatArray:
 
 
 def _to_middle_s(frames: pd.DataFrame, flight: Flight) -> FloatArray:
-    """Return what leads from the times of the file to mid-exposure [s]."""
+    """Return the differences of mid-exposure minus the times in the file [s]."""
     exposures_s = frames["exposure_time_s"].to_numpy(dtype=np.float64, na_value=np.nan)
     shift_s = flight.camera.time_reference.to_middle_s(1.0)
     return shift_s * exposures_s if shift_s else np.zeros(len(frames))
@@ -233,17 +239,17 @@ def _changed_frames(
     table: pd.DataFrame,
     flight: Flight,
     digests: Mapping[str, object],
-    today: list[str] | None,
+    frames_now: list[str] | None,
 ) -> Iterator[str]:
-    """Yield what is new in the frames' folder; frames that are gone do not count as a change."""
-    if today is None:
+    """Yield new or changed files of frames; missing frames do not count as a change."""
+    if frames_now is None:
         return
     known = set(table["frame"])
-    new = [frame for frame in today if frame not in known]
+    new = [frame for frame in frames_now if frame not in known]
     if new:
         yield f"{len(new)} new frames ({new[0]}, …)" if len(new) > 1 else f"a new frame ({new[0]})"
-    elif "frames" in digests and len(today) == len(known):
-        stamps = zip(today, stamps_of(flight.frames_folder, today), strict=True)
+    elif "frames" in digests and len(frames_now) == len(known):
+        stamps = zip(frames_now, stamps_of(flight.frames_folder, frames_now), strict=True)
         sizes = {frame: None if stamp is None else stamp[0] for frame, stamp in stamps}
         if digest(sizes) != digests["frames"]:
             yield "files of frames"
