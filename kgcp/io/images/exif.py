@@ -23,7 +23,7 @@ from kgcp.quality.checks.frame_header import FrameHeader
 
 _EXIF_MARK = b"Exif\0\0"
 _INCH = 2.0
-_UNITS_MM = {_INCH: 25.4, 3.0: 10.0, 4.0: 1.0}  # of resolutions, by their number in EXIF
+_UNITS_MM = {_INCH: 25.4, 3.0: 10.0, 4.0: 1.0}  # of length, by their number in EXIF
 _RELATIVE_ALTITUDE = re.compile(
     rb"""drone-dji:RelativeAltitude(?:="|>)\s*([+-]?\d{1,5}(?:\.\d{0,9})?)"""
 )
@@ -42,19 +42,19 @@ def read_exif(path: Path) -> Exif:
     """Read exposure and time of a frame without decoding its pixels.
 
     The time is DateTimeOriginal with SubSecTimeOriginal, a decimal fraction ("05" is 0.05 s), and
-    OffsetTimeOriginal. Where that is absent, OffsetTime serves, which is DateTime's, if DateTime
-    is the same moment (in an unedited file). Without an offset it is the local time of
-    an unknown place and is left out. So are the GPS stamps: they are UTC, but of the receiver's
-    last fix and mostly in whole seconds, in which a vehicle goes metres.
+    OffsetTimeOriginal. If that is absent, OffsetTime is used. It belongs to DateTime, which must be
+    the same moment, as in an unedited file. A time without offset is local to an unknown place and
+    is ignored. GPS stamps are ignored, too: they are UTC, but of the receiver's last fix, and
+    mostly in whole seconds, in which a vehicle moves by metres.
 
-    Whatever is damaged or absent is None; nothing is raised.
+    Damaged or absent values are None; nothing is raised.
     """
     if not is_file(path):  # opening a pipe would wait for ever
         return Exif()
     try:
         with warnings.catch_warnings(action="ignore"):
             tags = _exif_tags(path).main
-    except Exception:  # Pillow's parsers raise whatever a damaged header makes them stumble over
+    except Exception:  # damaged headers make Pillow raise any kind of exception
         return Exif()
     exposure = ExposureSettings(
         exposure_time_s=_positive(tags.get(Base.ExposureTime)),
@@ -66,7 +66,7 @@ def read_exif(path: Path) -> Exif:
 
 @dataclass(frozen=True, slots=True)
 class _Tags:
-    """What the metadata of a file hold: EXIF with its main part, GPS, and XMP as it lies there."""
+    """Metadata of a file: main part and GPS part of its EXIF, and raw XMP."""
 
     main: Mapping[int, Any] = field(default_factory=dict)
     gps: Mapping[int, Any] = field(default_factory=dict)
@@ -75,7 +75,7 @@ class _Tags:
 
 
 def load_formats() -> None:
-    """Load what reading the first file would load otherwise: 30 ms."""
+    """Load Pillow's formats, which would otherwise delay the first file by 30 ms."""
     Image.init()
 
 
@@ -105,47 +105,47 @@ def _exif_tags(path: Path) -> _Tags:
 def read_frame_header(path: Path, frame: str) -> FrameHeader:
     """Read what the header of a frame says, without decoding its pixels.
 
-    Whatever is damaged or absent is None; nothing is raised.
+    Damaged or absent values are None; nothing is raised.
     """
     if not is_file(path):
         return FrameHeader(frame)
     try:
         with warnings.catch_warnings(action="ignore"):
             tags = _exif_tags(path)
-        words = (_text(tags.main, tag) for tag in (Base.Make, Base.Model, Base.BodySerialNumber))
+        texts = (_text(tags.main, tag) for tag in (Base.Make, Base.Model, Base.BodySerialNumber))
         longitude_deg = _angle_deg(tags.gps, GPS.GPSLongitude, GPS.GPSLongitudeRef, "W", 180.0)
         latitude_deg = _angle_deg(tags.gps, GPS.GPSLatitude, GPS.GPSLatitudeRef, "S", 90.0)
-        is_placed = longitude_deg is not None and latitude_deg is not None
+        has_position = longitude_deg is not None and latitude_deg is not None
         size_px = tags.size_px or _size_px(path)
         return FrameHeader(
             frame,
             size_px,
-            camera=" ".join(filter(None, words)),
+            camera=" ".join(filter(None, texts)),
             focal_mm=_positive(tags.main.get(Base.FocalLength)),
             focal_35_mm=_positive(tags.main.get(Base.FocalLengthIn35mmFilm)),
             focal_px=_focal_px(tags.main, size_px),
             time_s=_time_s(tags.main),
-            longitude_deg=longitude_deg if is_placed else None,
-            latitude_deg=latitude_deg if is_placed else None,
+            longitude_deg=longitude_deg if has_position else None,
+            latitude_deg=latitude_deg if has_position else None,
             altitude_m=_altitude_m(tags.xmp),
         )
-    except Exception:  # Pillow's parsers raise whatever a damaged header makes them stumble over
+    except Exception:  # damaged headers make Pillow raise any kind of exception
         return FrameHeader(frame, _size_px(path))
 
 
 def _focal_px(tags: Mapping[int, Any], size_px: tuple[int, int] | None) -> float | None:
-    """Return the focal length by the resolution of the focal plane, also of a resized frame."""
+    """Return the focal length by the resolution of the focal plane, scaled to a resized frame."""
     focal_mm = _positive(tags.get(Base.FocalLength))
-    per_unit = _positive(tags.get(Base.FocalPlaneXResolution))
+    px_per_unit = _positive(tags.get(Base.FocalPlaneXResolution))
     unit_mm = _UNITS_MM.get(_positive(tags.get(Base.FocalPlaneResolutionUnit)) or _INCH)
-    if focal_mm is None or per_unit is None or unit_mm is None or size_px is None:
+    if focal_mm is None or px_per_unit is None or unit_mm is None or size_px is None:
         return None
-    full_px = _positive(tags.get(Base.ExifImageWidth)) or size_px[0]
-    return focal_mm * per_unit / unit_mm * size_px[0] / full_px
+    original_px = _positive(tags.get(Base.ExifImageWidth)) or size_px[0]
+    return focal_mm * px_per_unit / unit_mm * size_px[0] / original_px
 
 
 def _size_px(path: Path) -> tuple[int, int] | None:
-    """Return width and height also of files that Pillow refuses."""
+    """Return width and height, even of files that Pillow refuses."""
     try:
         with path.open("rb") as stream:
             return image_size(stream)
@@ -156,7 +156,7 @@ def _size_px(path: Path) -> tuple[int, int] | None:
 def _angle_deg(
     gps: Mapping[int, Any], tag: GPS, reference: GPS, negative: str, limit: float
 ) -> float | None:
-    """Return a longitude or latitude of degrees, minutes and seconds; 0, 0 is a missing fix."""
+    """Return a longitude or latitude of degrees, minutes and seconds; 0 means no fix."""
     parts = gps.get(tag)
     if not isinstance(parts, tuple) or len(parts) != 3:
         return None
@@ -173,7 +173,7 @@ def _altitude_m(xmp: bytes) -> float | None:
 
 
 def _positive(value: object) -> float | None:
-    """Return the first number of a tag, if it is one that a camera can have."""
+    """Return the first number of a tag if it is finite and positive."""
     first = value[0] if isinstance(value, tuple) and value else value
     if not isinstance(first, SupportsFloat):
         return None

@@ -30,7 +30,7 @@ FRAME_SUFFIXES = frozenset(
 )
 
 RESULTS_NAME = "kgcp"
-"""Of the results' folder in that of the flight."""
+"""Name of the results folder in the flight's folder."""
 
 _SHOWN_FRAMES = 3
 
@@ -41,32 +41,33 @@ _RAW_SUFFIXES = frozenset(
 _VIDEO_SUFFIXES = frozenset({".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mts", ".webm"})
 _PHONE_SUFFIXES = frozenset({".avif", ".heic", ".heif"})
 
-# The pixels as they lie in the file: raw orientation, full depth, one channel.
+# Pixels as they are stored: raw orientation, full depth, one channel.
 _RAW_GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
-_UNDECODED = re.compile("[\\udc80-\\udcff]")  # how bytes that are not UTF-8 come from the system
+_UNDECODED = re.compile("[\\udc80-\\udcff]")  # stand for bytes that are not UTF-8
 
-# Of a file: text takes most space, ten characters for a colour of 16 bits; metadata come on top.
-_MOST_BYTES_PER_PIXEL = 32
-_MOST_METADATA_BYTES = 1 << 26
+# Limits of a file's size. Text takes most space, ten characters for a colour of 16 bits. Metadata
+# are added.
+_MAX_BYTES_PER_PIXEL = 32
+_MAX_METADATA_BYTES = 1 << 26
 
 CORRECT_FOLDER = "correct [frames] folder in flight.toml"
 
-# libjpeg's words for data that it had to guess; it decodes on and only mentions it on stderr.
+# libjpeg's messages on stderr about data that it had to guess; it does not stop decoding.
 _GUESSED_PIXELS = ("Corrupt JPEG data", "Premature end of JPEG file")
 # OpenCV for Windows is linked with a C library of its own, whose stderr may not follow Python's.
-# Files that were cut are told by their missing end there.
-_HEARS_DECODERS = os.name != "nt"
-_STDERR = Lock()  # which a process has but once
+# There, cut files are recognised by their missing end.
+_COLLECTS_DECODER_MESSAGES = os.name != "nt"
+_STDERR_LOCK = Lock()  # a process has only one stderr
 
 
 def list_frames(folder: Path, remedy: str = CORRECT_FOLDER) -> list[str]:
     """List the images below a folder, as sorted relative paths with `/`.
 
-    Hidden files and folders are passed over; the suffix decides, in any case. Links to files
-    are followed, links to folders below `folder` are not (they may run in circles). Where the
-    flight's own folder has the frames, the results in it are not among them. `remedy` is what to do
-    if this is not the right folder.
+    Hidden files and folders are skipped. Images are recognised by their suffix, in upper or lower
+    case. Links to files are followed; links to folders below `folder` are not, as they may be
+    circular. If the frames are in the flight's own folder, its results folder is skipped. `remedy`
+    says what to do if this is not the right folder.
 
     Raises
     ------
@@ -91,18 +92,18 @@ def list_frames(folder: Path, remedy: str = CORRECT_FOLDER) -> list[str]:
 
 
 def frames_among(names: Sequence[str], folder: str, remedy: str = CORRECT_FOLDER) -> list[str]:
-    """Return the images among the files of a folder, by their paths below it, sorted.
+    """Return the images among the files of a folder: their paths below it, sorted.
 
     Raises
     ------
     KgcpError
-        If there are none; it says what the folder holds instead.
+        If there are none. The message says what the folder holds instead.
     """
-    shown = [name for name in names if not any(part[0] == "." for part in name.split("/"))]
-    frames = [name for name in shown if PurePosixPath(name).suffix.lower() in FRAME_SUFFIXES]
+    visible = [name for name in names if not any(part[0] == "." for part in name.split("/"))]
+    frames = [name for name in visible if PurePosixPath(name).suffix.lower() in FRAME_SUFFIXES]
     if frames:
         return sorted(frames)
-    counts = Counter(PurePosixPath(name).suffix.lower() for name in shown)
+    counts = Counter(PurePosixPath(name).suffix.lower() for name in visible)
     counts.pop("", None)
     if not counts:
         raise KgcpError(f"{folder}: holds no images; put them there or {remedy}")
@@ -116,29 +117,29 @@ def frames_among(names: Sequence[str], folder: str, remedy: str = CORRECT_FOLDER
 
 
 def matching_frames(frames: Sequence[str], patterns: Sequence[str]) -> list[str]:
-    """Return the frames that match one of the patterns, in their order; without patterns all.
+    """Return the frames that match one of the patterns, in the given order; all without patterns.
 
     Parameters
     ----------
     frames : sequence of str
         Paths below the frames folder.
     patterns : sequence of str
-        Of such paths, as of `fnmatch`: `*` also stands for `/`, and letter case counts. Folders may
-        be separated by backslashes.
+        Of such paths, in the notation of `fnmatch`: `*` also matches `/`, and letter case counts.
+        Backslashes may separate folders.
 
     Raises
     ------
     KgcpError
-        For a pattern that matches no frame; it names some frames.
+        If a pattern matches no frame. The message names some frames.
     """
     if not patterns:
         return list(frames)
     for pattern in patterns:
         if not any(is_chosen(frame, (pattern,)) for frame in frames):
-            some = ", ".join(frames[:_SHOWN_FRAMES])
+            examples = ", ".join(frames[:_SHOWN_FRAMES])
             raise KgcpError(
-                f"{pattern!r} matches none of {len(frames)} frames ({some}, …); give a pattern of"
-                ' their paths below the frames folder, such as "*_00??.JPG"',
+                f"{pattern!r} matches none of {len(frames)} frames ({examples}, …); give a pattern"
+                ' of their paths below the frames folder, such as "*_00??.JPG"',
                 option="frames",
             )
     return [frame for frame in frames if is_chosen(frame, patterns)]
@@ -147,14 +148,14 @@ def matching_frames(frames: Sequence[str], patterns: Sequence[str]) -> list[str]
 def is_chosen(frame: str, patterns: Sequence[str]) -> bool:
     """Return whether a frame matches one of the patterns of `matching_frames`."""
     return any(
-        fnmatch.fnmatchcase(frame, notation)
+        fnmatch.fnmatchcase(frame, form)
         for pattern in patterns
-        for notation in (pattern, pattern.replace("\\", "/"))
+        for form in (pattern, pattern.replace("\\", "/"))
     )
 
 
 def _kind_of(suffix: str) -> tuple[str, str]:
-    """Return what files of a suffix are that is not an image's, and what to do with them."""
+    """Return the kind of files with a suffix that is no image's, and how to convert them."""
     if suffix in _RAW_SUFFIXES:
         return "raw files", (
             "develop them to JPEG, PNG or TIFF without lens correction, cropping or sharpening"
@@ -188,9 +189,9 @@ def read_grey(path: Path, camera: Camera) -> GreyArray:
     Raises
     ------
     Rejection
-        `decode_failed`: not an image, damaged in whole or in part (also where the decoder would
-        fill the gap), or of another depth; `wrong_size`: not the camera's, which is known before
-        anything is decoded.
+        `decode_failed`: it is not an image, is damaged in whole or in part (even if the decoder
+        would fill the gap), or has another depth. `wrong_size`: its size is not the camera's, which
+        is checked before decoding.
     """
     grey = _decode(_encoded(path, camera))
     if grey.dtype not in (np.uint8, np.uint16):
@@ -201,24 +202,24 @@ def read_grey(path: Path, camera: Camera) -> GreyArray:
 
 
 def _encoded(path: Path, camera: Camera) -> bytes:
-    """Return the content of an image file, once its header says that it may be a frame."""
+    """Return the content of an image file if its header is that of a frame."""
     if os.path.lexists(path) and not is_file(path):  # opening a pipe would wait for ever
         raise Rejection(Reason.DECODE_FAILED, "is not a regular file")
     try:
         with path.open("rb") as stream:
-            found, size = image_size(stream), os.fstat(stream.fileno()).st_size
-            if found is None:
+            size_px, size = image_size(stream), os.fstat(stream.fileno()).st_size
+            if size_px is None:
                 raise Rejection(
                     Reason.DECODE_FAILED, f"{size} bytes that do not begin like an image"
                 )
-            _require_size(*found, camera)
-            most = _MOST_BYTES_PER_PIXEL * camera.width * camera.height + _MOST_METADATA_BYTES
-            if size > most:
+            _require_size(*size_px, camera)
+            max_size = _MAX_BYTES_PER_PIXEL * camera.width * camera.height + _MAX_METADATA_BYTES
+            if size > max_size:
                 raise Rejection(Reason.DECODE_FAILED, f"{size} bytes are too many for its pixels")
             data = upright(stream)
-    except OSError as error:  # without the path: a table is the same wherever its flight lies
+    except OSError as error:  # no path: tables must not depend on the folder
         raise Rejection(Reason.DECODE_FAILED, error.strerror or str(error)) from error
-    except ValueError as error:  # names that no file has
+    except ValueError as error:  # names that no file can have
         raise Rejection(Reason.DECODE_FAILED, str(error)) from error
     if is_cut_png(data):
         raise Rejection(Reason.DECODE_FAILED, f"a chunk ends beyond the {size} bytes of the file")
@@ -236,9 +237,9 @@ def _require_size(width: int, height: int, camera: Camera) -> None:
 def _decode(encoded: bytes) -> GreyArray:
     size = len(encoded)
     if encoded.startswith(JPEG_START):
-        if not _HEARS_DECODERS and is_cut_jpeg(encoded):
+        if not _COLLECTS_DECODER_MESSAGES and is_cut_jpeg(encoded):
             raise Rejection(Reason.DECODE_FAILED, _GUESSED_PIXELS[1])
-        # A truncated file gets an end: then every version of the decoder notices what is missing.
+        # Truncated files get an end: then every version of the decoder notices the gap.
         encoded += JPEG_END
     grey = None
     with _collected_stderr() as messages, suppress(cv2.error):
@@ -255,12 +256,12 @@ def _decode(encoded: bytes) -> GreyArray:
 def _collected_stderr() -> Iterator[list[str]]:
     """Collect what libraries write to the process's stderr, as lines, until the block ends.
 
-    The image decoders below OpenCV report damage in no other way. The whole process is
-    affected, so the block must be short, and threads enter it one after the other: else one would
+    The image decoders that OpenCV calls report damage in no other way. The whole process is
+    affected, so the block must be short. Threads enter it one after the other; otherwise one would
     restore the other's file as stderr.
     """
     messages: list[str] = []
-    with _STDERR, tempfile.TemporaryFile() as sink:
+    with _STDERR_LOCK, tempfile.TemporaryFile() as sink:
         sys.stderr.flush()
         stderr = os.dup(2)
         os.dup2(sink.fileno(), 2)

@@ -19,8 +19,8 @@ from kgcp.io.images.frames import frames_among, list_frames
 if TYPE_CHECKING:
     from pyarrow.fs import FileInfo, FileSystem
 
-_PAUSES_S = (1.0, 4.0, 16.0)  # before a read is tried again, beyond what Arrow itself tries
-_KNOWN = ("s3", "gs", "gcs")
+_PAUSES_S = (1.0, 4.0, 16.0)  # before a read is repeated, in addition to Arrow's own attempts
+_SCHEMES = ("s3", "gs", "gcs")
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,24 +31,24 @@ class StoredFolder:
     below: str = ""  # path below that, with `/`; empty: the folder itself
 
     def __truediv__(self, name: str) -> StoredFolder:
-        """Return what has this name in the folder."""
+        """Return the object or folder of this name in the folder."""
         return replace(self, below=f"{self.below}/{name}".strip("/"))
 
     def __str__(self) -> str:
-        """Name it without keys and options, which belong in no message."""
+        """Return the URL without keys and options, which must not appear in messages."""
         parts = urlsplit(self.url)
         place = f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}".rstrip("/")
         return f"{place}/{self.below}" if self.below else place
 
     @property
     def name(self) -> str:
-        """The last part of its path."""
+        """Last part of the path."""
         return str(self).rpartition("/")[2]
 
     def files(self, *, is_deep: bool) -> list[tuple[str, FileInfo]]:
-        """List what is in the folder, and with `is_deep` below it: names relative to it.
+        """List the files and folders in the folder, or with `is_deep` all files below it.
 
-        Folders are listed where `is_deep` is not.
+        Names are relative to the folder.
 
         Raises
         ------
@@ -58,9 +58,9 @@ class StoredFolder:
         from pyarrow.fs import FileSelector, FileType
 
         system, path = self._opened()
-        with self._told():
-            found = system.get_file_info(FileSelector(path, recursive=is_deep))
-        named = [(info.path[len(path) :].strip("/"), info) for info in found]
+        with self._reported():
+            infos = system.get_file_info(FileSelector(path, recursive=is_deep))
+        named = [(info.path[len(path) :].strip("/"), info) for info in infos]
         for name, _ in named:
             if {"", ".", ".."} & set(name.split("/")) or "\\" in name:
                 raise KgcpError(
@@ -69,17 +69,17 @@ class StoredFolder:
         return [each for each in named if not is_deep or each[1].type == FileType.File]
 
     def tree(self, passed_over: Sequence[str]) -> Iterator[str]:
-        """Yield what files are below the folder: names relative to it.
+        """Yield the files below the folder: names relative to it.
 
-        Hidden ones are left out, and the folders `passed_over`, which S3 does not even list; in
+        Hidden files and the folders `passed_over` are left out. S3 does not even list these; in
         `gs://` Arrow sees no folder that it does not list. Raises as `files`.
         """
-        above = [f"{each}/" for each in passed_over]
+        left_out = [f"{each}/" for each in passed_over]
         folders = [""]
         for folder in folders:
             for name, info in (self / folder).files(is_deep=self.url.startswith("g")):
                 path = f"{folder}/{name}".lstrip("/")
-                if "/." in f"/{path}" or any(map(f"{path}/".startswith, above)):
+                if "/." in f"/{path}" or any(map(f"{path}/".startswith, left_out)):
                     continue
                 if info.is_file:
                     yield path
@@ -102,11 +102,11 @@ class StoredFolder:
                 break
             except OSError:
                 time.sleep(pause_s)
-        with self._told():
+        with self._reported():
             return _content(system, path)
 
     def write(self, source: Path) -> None:
-        """Put a file here; it appears as a whole.
+        """Write a file here, which appears as a whole.
 
         Raises
         ------
@@ -117,7 +117,7 @@ class StoredFolder:
 
         system, path = self._opened()
         with (
-            self._told("cannot be written"),
+            self._reported("cannot be written"),
             pa.memory_map(str(source)) as content,
             system.open_output_stream(path) as stream,
         ):
@@ -125,15 +125,15 @@ class StoredFolder:
             stream.write(content.read_buffer())
 
     def require_writable(self) -> None:
-        """Write and delete an object, so that hours of work do not end here.
+        """Write and delete an object, to fail before hours of work instead of after.
 
         Raises
         ------
         KgcpError
-            If that cannot be done.
+            If either fails.
         """
         system, path = (self / ".kgcp")._opened()
-        with self._told("cannot be written"):
+        with self._reported("cannot be written"):
             with system.open_output_stream(path) as stream:
                 stream.write(b"kgcp")
             system.delete_file(path)
@@ -147,7 +147,7 @@ class StoredFolder:
             If the store does not answer.
         """
         system, path = (self / name)._opened()
-        with self._told():
+        with self._reported():
             return bool(system.get_file_info(path).is_file)
 
     def _opened(self) -> tuple[FileSystem, str]:
@@ -155,7 +155,7 @@ class StoredFolder:
         return system, f"{base}/{self.below}".rstrip("/")
 
     @contextmanager
-    def _told(self, what: str = "cannot be read") -> Iterator[None]:
+    def _reported(self, problem: str = "cannot be read") -> Iterator[None]:
         try:
             yield
         except FileNotFoundError as error:
@@ -164,18 +164,18 @@ class StoredFolder:
             ) from error
         except OSError as error:
             raise KgcpError(
-                f"{self}: {what} ({_line(error)}); see URL, keys and network, and repeat the"
+                f"{self}: {problem} ({_line(error)}); check URL, keys and network, and repeat the"
                 " command"
             ) from error
 
 
 def parsed_url(text: str) -> Path | StoredFolder:
-    """Return what a URL or a path of the command line names; `file://` is a path as any other.
+    """Return the path or the stored folder that a text names; `file://` URLs are paths.
 
     Raises
     ------
     KgcpError
-        If Arrow cannot open it.
+        If the location is not supported.
     """
     if "://" not in text:
         return Path(text)
@@ -186,7 +186,7 @@ def parsed_url(text: str) -> Path | StoredFolder:
         return Path(url2pathname(host + parts.path))
     if len(parts.scheme) == 1:  # the letter of a drive
         return Path(text)
-    if parts.scheme not in _KNOWN or not parts.netloc:
+    if parts.scheme not in _SCHEMES or not parts.netloc:
         raise KgcpError(
             f"{text}: unsupported location; use a folder, s3://bucket/folder or gs://bucket/folder"
         )
@@ -199,7 +199,7 @@ def frames_below(folder: Path | StoredFolder) -> list[str]:
     Raises
     ------
     KgcpError
-        As that, and if the store cannot be read.
+        As `list_frames`, and if the store cannot be read.
     """
     if isinstance(folder, Path):
         return list_frames(folder)
@@ -209,7 +209,7 @@ def frames_below(folder: Path | StoredFolder) -> list[str]:
 def stamps_of(
     folder: Path | StoredFolder, names: Sequence[str]
 ) -> Iterator[tuple[int, int] | None]:
-    """Yield size and time of change [ns] of files, which show whether one changed; None: missing.
+    """Yield sizes and modification times [ns] of files, which show changes; None: missing.
 
     Raises
     ------
@@ -219,9 +219,9 @@ def stamps_of(
     if isinstance(folder, Path):
         yield from (_stamp(folder / name) for name in names)
         return
-    found: Mapping[str, Any] = dict(folder.files(is_deep=True))
+    infos: Mapping[str, Any] = dict(folder.files(is_deep=True))
     for name in names:
-        info = found.get(name)
+        info = infos.get(name)
         yield None if info is None else (info.size, info.mtime_ns or 0)
 
 
@@ -235,9 +235,9 @@ def _stamp(path: Path) -> tuple[int, int] | None:
 
 @contextmanager
 def at_hand(folder: Path | StoredFolder, name: str) -> Iterator[Path]:
-    """Have a file of a folder as one that can be opened, until the block ends.
+    """Provide the path of a file that can be opened, until the block ends.
 
-    On Linux, an object's content is in memory and nowhere on a disk.
+    On Linux, an object's content is kept in memory and not written to a disk.
 
     Raises
     ------
@@ -267,7 +267,7 @@ def _system(url: str) -> tuple[FileSystem, str]:
 def _content(system: FileSystem, path: str) -> bytes:
     with system.open_input_file(path) as stream:
         if stream.closed:  # a stream of gs:// that has failed already
-            raise OSError("the store has broken off")
+            raise OSError("the store has closed the stream")
         content: bytes = stream.read()
     return content
 

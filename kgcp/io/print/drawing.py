@@ -1,7 +1,7 @@
 """Sheets as PDF, SVG and PNG: one matplotlib figure in true millimetres, the same bytes each time.
 
-Matplotlib draws its figures in inches. A sheet has a figure of just its size and no axes: shapes
-are placed by a transform from millimetres on paper, y down.
+Matplotlib draws its figures in inches. A sheet is a figure of exactly its size without
+axes. A transform places its shapes, which are in millimetres on paper, y down.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from kgcp.targets.shapes import LINE_MM, Circle, Primitive, Sheet, Text
 
 _MM_PER_INCH = 25.4
 _PT_PER_MM = 72.0 / _MM_PER_INCH
-_MOST_PIXELS = 400e6
-# Circles are cubic curves. Over 1/16 of a circle they are off by less than 1e-8 of the radius; the
-# chords that matplotlib paints in pictures instead are off by 0.04 px.
+_MAX_PIXELS = 400e6
+# Circles are cubic curves of 1/16 of a circle each, off by less than 1e-8 of the radius. In
+# pictures, matplotlib would paint chords instead, off by 0.04 px.
 _UNIT_CIRCLE = Outline.arc(0.0, 360.0, n=16)
 _STYLE = {
-    "pdf.fonttype": 42,  # words are type, which can be searched …
-    "svg.fonttype": "path",  # … but outlines in SVG, so that no typeface is needed
-    "svg.hashsalt": "kgcp",  # identifiers of the same figure are the same
-    "path.snap": False,  # edges stay where they are, whatever the pixels
+    "pdf.fonttype": 42,  # text stays text, which can be searched …
+    "svg.fonttype": "path",  # … but becomes outlines in SVG, which need no typeface
+    "svg.hashsalt": "kgcp",  # the same figure has the same identifiers
+    "path.snap": False,  # edges are not moved to whole pixels
     "path.simplify": False,
 }
 
@@ -77,24 +77,23 @@ def check_pixels(width_mm: float, height_mm: float, dpi: int) -> None:
     SettingError
     """
     pixels = width_mm * height_mm * (dpi / _MM_PER_INCH) ** 2
-    if pixels > _MOST_PIXELS:
-        most = int(dpi * (_MOST_PIXELS / pixels) ** 0.5)
+    if pixels > _MAX_PIXELS:
+        max_dpi = int(dpi * (_MAX_PIXELS / pixels) ** 0.5)
         raise SettingError(
             "dpi",
-            f"{dpi} makes {pixels / 1e6:.0f} million pixels of {width_mm:.0f} × {height_mm:.0f} mm",
-            f"give at most {most}, or take PDF, SVG or DXF",
+            f"{dpi} gives {pixels / 1e6:.0f} million pixels on {width_mm:.0f} × {height_mm:.0f} mm",
+            f"give at most {max_dpi}, or choose PDF, SVG or DXF",
         )
 
 
 def _figure(sheet: Sheet, dpi: int | None = None) -> Figure:
-    """Draw a sheet; for a picture of some resolution, on paper of whole pixels.
+    """Draw a sheet; with a resolution, on paper of whole pixels.
 
-    The scale is that of the resolution in any case: what is rounded is the margin at the right
-    and at the bottom.
+    Rounding changes the margins at the right and at the bottom, never the scale.
     """
     size_in = np.array([sheet.width_mm, sheet.height_mm]) / _MM_PER_INCH
     if dpi is not None:
-        size_in = (np.rint(size_in * dpi) + 1e-6) / dpi  # matplotlib rounds it down
+        size_in = (np.rint(size_in * dpi) + 1e-6) / dpi  # matplotlib rounds down
     figure = Figure(figsize=(size_in[0], size_in[1]), dpi=dpi or 72)
     inches = Affine2D().scale(1.0 / _MM_PER_INCH, -1.0 / _MM_PER_INCH).translate(0.0, size_in[1])
     paper = inches + figure.dpi_scale_trans

@@ -16,7 +16,7 @@ _COLOURS = {Layer.PLATE: 3, Layer.HOLES: 5, Layer.CROP: 8, Layer.WHITE: 1}  # Au
 
 
 def dxf_of(artwork: Artwork) -> bytes:
-    """Return the artwork as a DXF file, its origin in the circles' centre, y up."""
+    """Return the artwork as a DXF file, its origin at the circles' centre, y up."""
     was_fixed = ezdxf.options.write_fixed_meta_data_for_testing
     ezdxf.options.write_fixed_meta_data_for_testing = True  # neither dates nor random identifiers
     try:
@@ -39,8 +39,8 @@ def _add(space: Modelspace, shape: Primitive) -> None:
     if isinstance(shape, Text):
         words, size_mm = fit_text(shape)
         place = shape.start_mm[0], -shape.start_mm[1]
-        look = {"layer": Layer.TEXT.value, "style": _STYLE, "insert": place}
-        space.add_text(words, height=CAP_HEIGHT * size_mm, dxfattribs=look)
+        attributes = {"layer": Layer.TEXT.value, "style": _STYLE, "insert": place}
+        space.add_text(words, height=CAP_HEIGHT * size_mm, dxfattribs=attributes)
         return
     on_layer = {"layer": shape.layer.value}
     if isinstance(shape, Circle):

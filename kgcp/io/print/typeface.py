@@ -13,8 +13,8 @@ from matplotlib.textpath import text_to_path
 from kgcp.targets.shapes import Text
 
 CAP_HEIGHT = 0.73
-"""Height of capitals relative to the type's size."""
-_UNKNOWN = "?"
+"""Height of capitals relative to the type size."""
+_REPLACEMENT = "?"
 
 
 def font(*, is_bold: bool) -> FontProperties:
@@ -23,14 +23,14 @@ def font(*, is_bold: bool) -> FontProperties:
 
 
 def printable(text: str, *, is_bold: bool = False) -> str:
-    """Return a text with question marks for characters that the typeface lacks, as Chinese."""
+    """Return a text with question marks for characters that the typeface lacks."""
     characters = _characters(is_bold=is_bold)
-    return "".join(letter if ord(letter) in characters else _UNKNOWN for letter in text)
+    return "".join(letter if ord(letter) in characters else _REPLACEMENT for letter in text)
 
 
 @cache
 def fit_text(text: Text) -> tuple[str, float]:
-    """Return what is printable of a text, and the type's size [mm] at which it fits."""
+    """Return the printable form of a text, and the type size [mm] at which it fits."""
     words = printable(text.words, is_bold=text.is_bold)
     typeface = font(is_bold=text.is_bold)
     typeface.set_size(text.size_mm)

@@ -1,4 +1,4 @@
-"""Sheets into files of the chosen formats."""
+"""Writing sheets to files of the chosen formats."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from kgcp.io.print.dxf import dxf_of
 from kgcp.targets.shapes import Sheet
 
 FORMATS = ("pdf", "svg", "dxf", "png")
-_LONGEST_STEM = 100  # bytes: names have at most 255, whole paths on Windows mostly 260
+_MAX_STEM_BYTES = 100  # names have at most 255, whole paths on Windows mostly 260
 
 
 def file_stem(name: str) -> str:
     """Return a file name for a target that every file system takes.
 
-    It begins with a word, so that it is none of the names that Windows keeps for devices (CON,
-    NUL, …). Of long names it has the beginning and a digest, for the letters that are left out.
+    It begins with a word, so that it is none of the names that Windows reserves for devices
+    (CON, NUL, …). Long names are cut, and a digest stands for what is left out.
     """
     stem = "target_" + re.sub(r"[^\w.-]+", "_", name)
     encoded = stem.encode()
-    if len(encoded) <= _LONGEST_STEM:
+    if len(encoded) <= _MAX_STEM_BYTES:
         return stem
     digest = hashlib.sha256(encoded).hexdigest()[:8]
-    return f"{encoded[:_LONGEST_STEM].decode(errors='ignore')}_{digest}"
+    return f"{encoded[:_MAX_STEM_BYTES].decode(errors='ignore')}_{digest}"
 
 
 def check_stems(names: Sequence[str]) -> None:
@@ -42,7 +42,7 @@ def check_stems(names: Sequence[str]) -> None:
     for name in names:
         other = stems.setdefault(file_stem(name).casefold(), name)
         if other != name:
-            problem = f"{other!r} and {name!r} would both be the file {file_stem(name)!r}"
+            problem = f"{other!r} and {name!r} would both have the file name {file_stem(name)!r}"
             raise SettingError("name", problem, "rename one of them")
 
 
@@ -72,7 +72,7 @@ def write_sheets(
 def _contents(
     sheets: Sequence[Sheet], title: str, form: str, dpi: int
 ) -> Iterator[tuple[str, bytes]]:
-    """Yield the files of a format, each with the label of its sheet or, of all sheets, none."""
+    """Yield the files of a format with the labels of their sheets; a file of all has none."""
     if form == "pdf":
         yield "", pdf_of(sheets, title)
     elif form == "dxf":

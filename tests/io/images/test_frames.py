@@ -154,7 +154,7 @@ class TestReadGrey:
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, progressive: int
     ) -> None:
         monkeypatch.setattr(frames, "_collected_stderr", lambda: nullcontext([]))
-        monkeypatch.setattr(frames, "_HEARS_DECODERS", False)
+        monkeypatch.setattr(frames, "_COLLECTS_DECODER_MESSAGES", False)
         thumbnail = encoded(textured()[:20, :30], ".jpg")
         exif = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2) + thumbnail
         data = encoded(textured(), ".jpg", cv2.IMWRITE_JPEG_PROGRESSIVE, progressive)

@@ -360,14 +360,14 @@ def test_the_bytes_do_not_depend_on_the_process(tmp_path: Path) -> None:
 
 def test_pictures_of_too_many_pixels_are_refused() -> None:
     check_pixels(1000.0, 1000.0, 500)
-    with pytest.raises(SettingError, match=r"dpi: 1200 makes .* give at most 508"):
+    with pytest.raises(SettingError, match=r"dpi: 1200 gives .* give at most 508"):
         check_pixels(1000.0, 1000.0, 1200)
 
 
 def test_file_names_are_safe_and_differ() -> None:
     assert file_stem("A/../b c") == "target_A_.._b_c"
     check_stems(["A", "B"])
-    with pytest.raises(SettingError, match="'a b' and 'A_B' would both be"):
+    with pytest.raises(SettingError, match="'a b' and 'A_B' would both have"):
         check_stems(["a b", "A_B"])
 
 
