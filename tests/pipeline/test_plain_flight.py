@@ -298,7 +298,7 @@ def test_frames_before_and_after_tell_where_they_are(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("frame,target,x_px\nf_0.png,white,1", "lacks the columns y_px"),
-        ("frame,target,x_px,y_px\nf_9.png,white,1,2", "line 2: 'f_9.png' is no frame"),
+        ("frame,target,x_px,y_px\nf_9.png,white,1,2", "line 2: 'f_9.png' is not a frame"),
         ("frame,target,x_px,y_px\nf_0.png,red,1,2", "line 2: 'red' is not a static target"),
         ("frame,target,x_px,y_px,sd_px\nf_0.png,white,1,2,0", "line 2: sd_px is 0"),
         ("frame,target,x_px,y_px" + 2 * "\nf_0.png,white,1,2", "line 3: 'white' is marked twice"),

@@ -1,4 +1,4 @@
-"""A calibrated camera as other programs read it, each in its own pixels and order of terms.
+"""A calibrated camera as files of other programs, with their pixels and order of terms.
 
 `kgcp.io.formats.calibrations` has the readers of all of these, with the sources of their
 conventions. A model that a format cannot hold is refused by name.
@@ -20,20 +20,20 @@ from kgcp.geometry.camera import Camera
 
 _CENTRE_TO_CORNER_PX = 0.5
 _RATIONAL = ("k4", "k5", "k6")
-_MM_PER_PX = 0.001  # of a sensor whose size nobody knows, in formats that want millimetres
+_MM_PER_PX = 0.001  # assumed: formats in millimetres need a sensor size, which is not known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibratedCamera:
-    """What is written."""
+    """A camera and its precision."""
 
     camera: Camera
     cov: FloatArray  # (12, 12): of `CALIBRATION_PARAMETERS`
     rms_px: float  # per point
 
 
-def _opencv(made: CalibratedCamera) -> str:
-    camera = made.camera
+def _opencv(calibrated: CalibratedCamera) -> str:
+    camera = calibrated.camera
     return "\n".join(
         [
             "%YAML:1.0",
@@ -42,9 +42,9 @@ def _opencv(made: CalibratedCamera) -> str:
             f"image_height: {camera.height}",
             *_opencv_matrix("camera_matrix", _camera_matrix(camera)),
             *_opencv_matrix("distortion_coefficients", np.array([_coefficients(camera)])),
-            f"avg_reprojection_error: {made.rms_px!r}",
+            f"avg_reprojection_error: {calibrated.rms_px!r}",
             f'calibration_covariance_of: "{" ".join(CALIBRATION_PARAMETERS)}"',
-            *_opencv_matrix("calibration_covariance", made.cov),
+            *_opencv_matrix("calibration_covariance", calibrated.cov),
             "",
         ]
     )
@@ -63,14 +63,14 @@ def _opencv_matrix(name: str, matrix: FloatArray) -> list[str]:
 
 
 def _opencv_number(value: float) -> str:
-    """Return a number with all its digits; OpenCV wants a point in each."""
+    """Return a number with all its digits and a point, which OpenCV requires."""
     text = repr(value)
     mantissa, mark, exponent = text.partition("e")
     return text if "." in mantissa else f"{mantissa}.0{mark}{exponent}"
 
 
-def _ros(made: CalibratedCamera) -> str:
-    camera = made.camera
+def _ros(calibrated: CalibratedCamera) -> str:
+    camera = calibrated.camera
     coefficients = _coefficients(camera)
     model = "plumb_bob" if len(coefficients) == 5 else "rational_polynomial"
     projection = np.column_stack((_camera_matrix(camera), np.zeros(3)))
@@ -97,8 +97,8 @@ def _ros(made: CalibratedCamera) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _metashape(made: CalibratedCamera) -> str:
-    camera = made.camera
+def _metashape(calibrated: CalibratedCamera) -> str:
+    camera = calibrated.camera
     _refuse_rational(camera, "Metashape")
     values = {
         "f": camera.fy,
@@ -108,17 +108,17 @@ def _metashape(made: CalibratedCamera) -> str:
         "k1": camera.k1,
         "k2": camera.k2,
         "k3": camera.k3,
-        "p1": camera.p2,  # Metashape has the two the other way round
+        "p1": camera.p2,  # Metashape exchanges the two
         "p2": camera.p1,
     }
     order = ("fy", "cx", "cy", "fx", "k1", "k2", "k3", "p2", "p1")
-    places = [CALIBRATION_PARAMETERS.index(name) for name in order]
-    by = np.eye(9)
-    by[3, 0] = -1.0  # b1 = fx - fy
-    cov = by @ made.cov[np.ix_(places, places)] @ by.T
-    known = [index for index in range(9) if cov[index, index] > 0.0]
-    names = [name for index, name in enumerate(values) if index in known]
-    coefficients = " ".join(map(repr, cov[np.ix_(known, known)].ravel().tolist()))
+    indices = [CALIBRATION_PARAMETERS.index(name) for name in order]
+    jacobian = np.eye(9)
+    jacobian[3, 0] = -1.0  # b1 = fx - fy
+    cov = jacobian @ calibrated.cov[np.ix_(indices, indices)] @ jacobian.T
+    estimated = [index for index in range(9) if cov[index, index] > 0.0]
+    names = [name for index, name in enumerate(values) if index in estimated]
+    coefficients = " ".join(map(repr, cov[np.ix_(estimated, estimated)].ravel().tolist()))
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         "<calibration>",
@@ -135,38 +135,38 @@ def _metashape(made: CalibratedCamera) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _colmap(made: CalibratedCamera) -> str:
-    camera = made.camera
+def _colmap(calibrated: CalibratedCamera) -> str:
+    camera = calibrated.camera
     x, y = camera.cx + _CENTRE_TO_CORNER_PX, camera.cy + _CENTRE_TO_CORNER_PX
     params = [camera.fx, camera.fy, x, y, camera.k1, camera.k2, camera.p1, camera.p2]
-    rest = [camera.k3, camera.k4, camera.k5, camera.k6]
-    model = "FULL_OPENCV" if any(rest) else "OPENCV"
-    numbers = [*params, *(rest if any(rest) else ())]
+    higher_terms = [camera.k3, camera.k4, camera.k5, camera.k6]
+    model = "FULL_OPENCV" if any(higher_terms) else "OPENCV"
+    numbers = [*params, *(higher_terms if any(higher_terms) else ())]
     return (
         "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
         f"1 {model} {camera.width} {camera.height} {' '.join(map(repr, numbers))}\n"
     )
 
 
-def _opensfm(made: CalibratedCamera) -> str:
-    camera = made.camera
+def _opensfm(calibrated: CalibratedCamera) -> str:
+    camera = calibrated.camera
     _refuse_rational(camera, "OpenSfM")
-    longer = max(camera.width, camera.height)
+    longer_side = max(camera.width, camera.height)
     model = {
         "projection_type": "brown",
         "width": camera.width,
         "height": camera.height,
-        "focal_x": camera.fx / longer,
-        "focal_y": camera.fy / longer,
-        "c_x": (camera.cx - 0.5 * (camera.width - 1)) / longer,
-        "c_y": (camera.cy - 0.5 * (camera.height - 1)) / longer,
+        "focal_x": camera.fx / longer_side,
+        "focal_y": camera.fy / longer_side,
+        "c_x": (camera.cx - 0.5 * (camera.width - 1)) / longer_side,
+        "c_y": (camera.cy - 0.5 * (camera.height - 1)) / longer_side,
         **{name: getattr(camera, name) for name in ("k1", "k2", "p1", "p2", "k3")},
     }
     return json.dumps({"all": model}, indent=4) + "\n"
 
 
-def _pix4d(made: CalibratedCamera) -> str:
-    camera = made.camera
+def _pix4d(calibrated: CalibratedCamera) -> str:
+    camera = calibrated.camera
     _refuse_rational(camera, "Pix4D")
     _refuse_aspect(camera, "Pix4D")
     width_mm, height_mm = camera.width * _MM_PER_PX, camera.height * _MM_PER_PX
@@ -182,8 +182,8 @@ def _pix4d(made: CalibratedCamera) -> str:
     )
 
 
-def _opf(made: CalibratedCamera) -> str:
-    camera = made.camera
+def _opf(calibrated: CalibratedCamera) -> str:
+    camera = calibrated.camera
     _refuse_rational(camera, "OPF")
     _refuse_aspect(camera, "OPF")
     internals = {
@@ -214,17 +214,17 @@ def _opf(made: CalibratedCamera) -> str:
     return json.dumps(document, indent=4) + "\n"
 
 
-def _mmvii(made: CalibratedCamera) -> str:
-    camera = made.camera
+def _mmvii(calibrated: CalibratedCamera) -> str:
+    camera = calibrated.camera
     _refuse_rational(camera, "MMVII")
     _refuse_aspect(camera, "MMVII")
-    sd = np.sqrt(made.cov.diagonal())
-    stated = ", ".join(
+    sd = np.sqrt(calibrated.cov.diagonal())
+    deviations = ", ".join(
         f"{name} {value:.3g}" for name, value in zip(CALIBRATION_PARAMETERS, sd, strict=True)
     )
     groups = {
         "Radial": {"K1": camera.k1, "K2": camera.k2, "K3": camera.k3},
-        "Decentric": {"p1": camera.p2, "p2": camera.p1},  # the other way round
+        "Decentric": {"p1": camera.p2, "p2": camera.p1},  # MMVII exchanges the two
         "Polynomial": {"b1": 0.0, "b2": 0.0},
     }
     terms: list[str] = []
@@ -258,7 +258,7 @@ def _mmvii(made: CalibratedCamera) -> str:
         *terms,
         "         </Distorsion>",
         "         <Informations>",
-        f'            <el>"kgcp; standard deviations: {stated}"</el>',
+        f'            <el>"kgcp; standard deviations: {deviations}"</el>',
         "         </Informations>",
         "      </InternalCalibration>",
         "   </Data>",
@@ -282,23 +282,23 @@ CAMERA_FORMATS = tuple(_FORMATS)
 """Names of the formats."""
 
 ONE_FOCAL_LENGTH = ("pix4d", "opf", "mmvii")
-"""Those that hold no camera whose fx and fy differ."""
+"""Names of the formats that cannot hold different fx and fy."""
 
 
-def camera_file(made: CalibratedCamera, form: str) -> tuple[str, str]:
+def camera_file(calibrated: CalibratedCamera, form: str) -> tuple[str, str]:
     """Return the name and the text of a camera's file.
 
     Raises
     ------
     KgcpError
-        If the format cannot hold the camera's model; it names the terms.
+        If the format cannot hold the camera's model. The message names the terms.
     """
     name, write = _FORMATS[form]
-    return name, write(made)
+    return name, write(calibrated)
 
 
 def not_renewed(folder: Path, written: Collection[Path]) -> tuple[str, ...]:
-    """Return the formats of which an earlier calibration has left a file not written now."""
+    """Return the formats whose file is left from an earlier calibration and not written now."""
     paths = {form: folder / name for form, (name, _) in _FORMATS.items()}
     return tuple(form for form, path in paths.items() if path not in written and path.exists())
 
@@ -317,7 +317,7 @@ def _refuse_rational(camera: Camera, program: str) -> None:
     terms = [name for name in _RATIONAL if getattr(camera, name)]
     if terms:
         raise KgcpError(
-            f"the camera's {', '.join(terms)} have no place in a camera of {program}; calibrate"
+            f"the camera's {', '.join(terms)} cannot be written for {program}; calibrate"
             " without the rational model, or choose other formats"
         )
 
@@ -325,6 +325,6 @@ def _refuse_rational(camera: Camera, program: str) -> None:
 def _refuse_aspect(camera: Camera, program: str) -> None:
     if camera.fx != camera.fy:
         raise KgcpError(
-            f"the camera's fx and fy differ, and a camera of {program} has one focal length;"
+            f"the camera's fx and fy differ, but cameras of {program} have one focal length;"
             " calibrate with one, or choose other formats"
         )

@@ -1,4 +1,4 @@
-"""Lists of frames that the user wants left out, written by hand or by the contact sheet."""
+"""Lists of frames to leave out, written by hand or by the contact sheet."""
 
 from __future__ import annotations
 
@@ -28,15 +28,16 @@ class Exclusion:
 
 
 def read_exclusions(path: Path) -> tuple[Exclusion, ...]:
-    """Read a list: a frame, or frame and target, in every line; `#` begins a comment.
+    """Read a list with a frame, or frame and target, in every line; `#` begins a comment.
 
-    A first line of column names, `flight`, `frame` and `target`, gives them another order and may
-    add the flight. Cells are separated by commas or semicolons.
+    A first line of the column names `flight`, `frame` and `target` may give another order and add
+    the flight. Cells are separated by commas or semicolons.
 
     Raises
     ------
     KgcpError
-        Naming the line: the file is missing, or a line has no frame or too many cells.
+        If the file is missing, or a line has no frame or too many cells. The message names the
+        line.
     """
     if not is_file(path):
         raise KgcpError(f"{path}: does not exist; name a file of frames to leave out")
@@ -57,7 +58,7 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
             except csv.Error as error:
                 raise KgcpError(f"{path}, line {number}: {error}; repair the line") from error
             while cells and not cells[-1]:
-                cells.pop()  # as a spreadsheet adds them
+                cells.pop()  # empty cells that spreadsheets add
             yield number, cells
 
 

@@ -1,4 +1,4 @@
-"""Names in a file against those of the frames: which are meant, and why others are not."""
+"""Match names in a file with those of the frames, and explain why others do not match."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kgcp.io.files.sniff import ForeignFile
 
 _Key = Callable[[PurePosixPath], str]
 
-# What two names have in common where they differ in one thing only; the commonest slips first.
+# Differences of names, and what two names then have in common; the commonest slips first.
 _DIFFERENCES: tuple[tuple[str, _Key], ...] = (
     ("upper and lower case differ", lambda path: str(path).lower()),
     ("the extension differs", lambda path: str(path.with_suffix(""))),
@@ -22,12 +22,12 @@ _DIFFERENCES: tuple[tuple[str, _Key], ...] = (
 
 
 def likely_difference(names: Sequence[str], frames: Sequence[str]) -> tuple[str, str, str] | None:
-    """Return what distinguishes names from those of the frames they probably mean.
+    """Return how names differ from those of the frames that they probably mean.
 
     Parameters
     ----------
     names : sequence of str
-        None of which is a frame's.
+        None of them is a frame's.
     frames : sequence of str
         Paths below the frames folder.
 
@@ -54,28 +54,28 @@ def _path(name: str) -> PurePosixPath:
 def frames_of(file: ForeignFile, names: Sequence[str], frames: Sequence[str]) -> tuple[str, ...]:
     """Return the frames of these names.
 
-    Other programs call images by their path, the end of it, the file's name alone, or that without
-    its extension; letters keep their case. A name that fits no frame stays as it is.
+    Other programs name images by their path, the end of it, the file name, or the file name without
+    extension. Letter case counts. A name that fits no frame is kept.
 
     Parameters
     ----------
     frames : sequence of str
-        Of the flight, relative to the frames folder; each may stand there repeatedly.
+        Of the flight, relative to the frames folder; they may repeat.
 
     Raises
     ------
     KgcpError
-        If a name fits several frames, or two names the same.
+        If a name fits several frames, or two names fit one frame.
     """
     owners: dict[str, str] = {}
     by_name: dict[str, list[str]] = defaultdict(list)
-    known = set(frames)
-    for frame in sorted(known):
+    all_frames = set(frames)
+    for frame in sorted(all_frames):
         path = PurePosixPath(frame)
         for key in {path.name, path.stem}:
             by_name[key].append(frame)
     for name in names:
-        frame = _frame_of(file, frame_name(name), known, by_name)
+        frame = _frame_of(file, frame_name(name), all_frames, by_name)
         if frame in owners:
             raise file.error(
                 f"images {owners[frame]!r} and {name!r} are both {frame!r}", "keep one of them"
@@ -87,15 +87,15 @@ def frames_of(file: ForeignFile, names: Sequence[str], frames: Sequence[str]) ->
 def _frame_of(file: ForeignFile, name: str, frames: set[str], by_name: dict[str, list[str]]) -> str:
     if name in frames:
         return name
-    fitting = by_name.get(PurePosixPath(name).name, [])
-    if len(fitting) > 1:  # folders may tell them apart
-        fitting = [frame for frame in fitting if _ends_alike(name, frame)] or fitting
-    if len(fitting) > 1:
+    candidates = by_name.get(PurePosixPath(name).name, [])
+    if len(candidates) > 1:  # folders may distinguish them
+        candidates = [frame for frame in candidates if _ends_alike(name, frame)] or candidates
+    if len(candidates) > 1:
         raise file.error(
-            f"image {name!r} may be {fitting[0]!r} or {fitting[1]!r}",
+            f"image {name!r} may be {candidates[0]!r} or {candidates[1]!r}",
             "rename the frames so that their names differ",
         )
-    return fitting[0] if fitting else name
+    return candidates[0] if candidates else name
 
 
 def _ends_alike(name: str, frame: str) -> bool:

@@ -1,4 +1,4 @@
-"""When the frames were taken: a table of times, or the marks that a receiver made of exposures."""
+"""Times of the frames: a table, or the marks of exposures that a receiver recorded."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ _LAST_NUMBER = re.compile(r"(.*?)(\d+)\D*")
 
 @dataclass(frozen=True, slots=True)
 class FrameTimes:
-    """What a times file says of frames, by their names.
+    """Content of a times file, by the names of frames.
 
-    Entries that belong to no frame stand under what they are called in the file.
+    Entries that belong to no frame are stored under their names in the file.
     """
 
     time_s: Mapping[str, float]  # Unix UTC [s]
-    # of the scene at that time: the camera's rates about its axes, turned round
+    # of the scene at that time: the camera's rates about its axes with the opposite sign
     rotation: Mapping[str, SceneRotation] = field(default_factory=dict)
 
 
@@ -54,7 +54,8 @@ def read_times(path: Path, frames: Sequence[str], times_format: str | None = Non
     Raises
     ------
     KgcpError
-        Naming file and line: it is missing or wrong, or its marks cannot be assigned to frames.
+        If the file is missing or wrong, or its marks cannot be assigned to frames. The message
+        names file and line.
     """
     file = ForeignFile(path, "[frames] times")
     times = FORMATS.reader(file, times_format)(file, frames)
@@ -66,9 +67,8 @@ def read_times(path: Path, frames: Sequence[str], times_format: str | None = Non
 def _read_csv(file: ForeignFile, frames: Sequence[str]) -> FrameTimes:
     """Return the columns frame and time; times are mid-exposure, in the notations of `parse_time`.
 
-    The camera's rates may stand beside them.
-
-    Frames are named as `kgcp.io.images.frames.list_frames` does.
+    There may also be columns of the camera's rates. Frames are named as by
+    `kgcp.io.images.frames.list_frames`.
     """
     columns = read_csv_columns(file.path, ("frame", "time"), (), (*_RATES, _SD_RATE), file.toml_key)
     times = {}
@@ -86,14 +86,14 @@ def _read_csv(file: ForeignFile, frames: Sequence[str]) -> FrameTimes:
 
 
 def _rotations(columns: CsvColumns, frames: Iterable[str]) -> dict[str, SceneRotation]:
-    """Return the rotation of the scene by frame; nothing if the file has no rates."""
+    """Return the rotation of the scene by frame; empty if the file has no rates."""
     if not set(_RATES) & set(columns.names):
         return {}
-    absent = [name for name in _RATES if name not in columns.names]
-    if absent:
+    missing = [name for name in _RATES if name not in columns.names]
+    if missing:
         raise KgcpError(
-            f"{columns.path}, line 1: has no {', '.join(absent)}; give the rates about all three of"
-            " the camera's axes, or none"
+            f"{columns.path}, line 1: has no {', '.join(missing)}; give the rates about all three"
+            " of the camera's axes, or none"
         )
     sds = columns.deviations((_SD_RATE,))
     sd_rad_s = np.radians(np.full(len(columns.lines), _SD_RATE_DEG_S) if sds is None else sds[:, 0])
@@ -105,11 +105,11 @@ def _rotations(columns: CsvColumns, frames: Iterable[str]) -> dict[str, SceneRot
 
 
 def _no_common_name(file: ForeignFile, names: Sequence[str], frames: Sequence[str]) -> KgcpError:
-    name, frame, why = likely_difference(names, frames) or (names[0], frames[0], "")
-    because = f" ({why})" if why else ""
+    name, frame, difference = likely_difference(names, frames) or (names[0], frames[0], "")
+    explanation = f" ({difference})" if difference else ""
     return file.error(
         f"none of its {len(names)} names is a frame's: it has {name!r}, the frames folder has"
-        f" {frame!r}{because}",
+        f" {frame!r}{explanation}",
         "write names as paths below the frames folder, or give the times of these frames",
     )
 
@@ -122,8 +122,8 @@ def looks_like_marks(file: ForeignFile) -> bool:
 def _read_marks(file: ForeignFile, frames: Sequence[str]) -> FrameTimes:
     """Return the times of DJI's marks by frame: a mark's number is the last one in a frame's name.
 
-    Their positions are the antenna's, and the offsets to the sensor beside it (north, east and
-    **down**, mm) are of the drone: a vehicle's target needs neither.
+    Marks also have positions of the antenna, and offsets from it to the sensor (north, east and
+    **down**, mm). Both are those of the drone, and a vehicle's target needs neither.
     """
     path = file.path
     clocks: dict[int, FloatArray] = {}
@@ -162,9 +162,9 @@ def _join_by_number(
         if match is None or int(match[2]) not in marks:
             continue
         number = int(match[2])
-        before = str(PurePosixPath(frame).parent / match[1])
-        other, other_before = owners.setdefault(number, (frame, before))
-        if before != other_before:
+        prefix = str(PurePosixPath(frame).parent / match[1])
+        other, other_prefix = owners.setdefault(number, (frame, prefix))
+        if prefix != other_prefix:
             raise file.error(
                 f"its number {number} may be that of {other!r} or of {frame!r}",
                 "give the frames of one flight, or frames.csv",
@@ -176,16 +176,16 @@ def _join_by_number(
             f" ({frames[0]!r}, …)",
             "give the marks of this flight, or frames.csv",
         )
-    spare = {str(number): time for number, time in marks.items() if number not in owners}
-    return FrameTimes({**spare, **times})
+    unassigned = {str(number): time for number, time in marks.items() if number not in owners}
+    return FrameTimes({**unassigned, **times})
 
 
 def _read_events(file: ForeignFile, frames: Sequence[str]) -> FrameTimes:
-    """Return the times of RTKLIB's events by frame, in their order: events have no names."""
+    """Return the times of RTKLIB's events by frame, in the same order, as events have no names."""
     solution = read_solution(file)
     if len(solution.time_s) != len(frames):
         raise file.error(
-            f"has {len(solution.time_s)} events for {len(frames)} frames, and nothing tells which"
+            f"has {len(solution.time_s)} events for {len(frames)} frames, so it is unknown which"
             " belong together (RTKLIB keeps one event per epoch of observations and loses the"
             " others)",
             "add or remove frames that differ, or give frames.csv",

@@ -21,7 +21,7 @@ _ISO = re.compile(
 
 
 def times_of_names(frames: Sequence[str]) -> dict[str, float] | None:
-    """Return the frames' times by their names, Unix UTC [s]; None where not every name has one.
+    """Return the times in the frames' names, Unix UTC [s]; None unless each has its own.
 
     Parameters
     ----------

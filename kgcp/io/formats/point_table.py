@@ -1,4 +1,4 @@
-"""Tables of surveyed points: a name and a place in every row."""
+"""Tables of surveyed points: a name and coordinates in every row."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class PointTable:
 
     @property
     def first_xy(self) -> tuple[float, float] | None:
-        """The place of the first point; None where these are not numbers."""
+        """The place of the first point; None if these are not numbers."""
         x, y = self.table.number("x"), self.table.number("y")
         return None if x is None or y is None else (x, y)
 
@@ -54,7 +54,7 @@ class PointTable:
 
 
 def recognised_points(file: ForeignFile) -> PointTable | None:
-    """Return a file as a table of points; None where it has not names and places."""
+    """Return a file as a table of points; None if it lacks names or coordinates."""
     table = sniff_table(file, _COLUMNS)
     if table is None or table.cells.keys() != _COLUMNS.keys():
         return None

@@ -1,4 +1,4 @@
-"""Formats of one kind of file: how each is recognised by its content, and who reads it."""
+"""Formats of one kind of file: how the content is recognised, and the readers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from kgcp.io.files.sniff import ForeignFile
 Read = TypeVar("Read")
 """Type of the function that reads a file of some format."""
 
-_CSV_NAMES = ("time", "frame", "x", "y", "z")  # of columns, that every CSV file has some of
+_CSV_NAMES = ("time", "frame", "x", "y", "z")  # columns; every CSV file has some of them
 _OTHER_TEXTS = {b"\xff\xfe": "UTF-16", b"\xfe\xff": "UTF-16", b"PK": "a spreadsheet or archive"}
 
 
@@ -50,7 +50,7 @@ class Registry(Generic[Read]):
         Raises
         ------
         KgcpError
-            If it has none of these formats.
+            If the file has none of these formats.
         """
         for name, (matches, _) in self.formats.items():
             if matches(file):

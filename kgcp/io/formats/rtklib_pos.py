@@ -32,7 +32,7 @@ class RtklibSolution:
     time_s: FloatArray  # (n,): Unix time, UTC [s]
     # by the header's names without units, angles in degrees: `latitude`, `x-ecef`, `sdn`, …
     columns: Mapping[str, FloatArray]
-    # from the header, `WGS84` and `ellipsoidal`; empty where it has neither
+    # from the header, for example `WGS84` and `ellipsoidal`; empty if it has none
     datum: str
     heights: str
 
@@ -50,7 +50,7 @@ def read_solution(file: ForeignFile) -> RtklibSolution:
     Raises
     ------
     KgcpError
-        Naming the line: no header, a row that is too short, or a cell that is not a number.
+        If there is no header, a row is too short, or a cell is not a number.
     """
     lines = enumerate(read_lines(file.path, file.toml_key), start=1)
     rows = [(number, row.strip()) for number, row in lines if row.strip()]
@@ -63,23 +63,23 @@ def read_solution(file: ForeignFile) -> RtklibSolution:
     names = _NAME.findall(header[2])
     width = sum(3 if unit == _SEXAGESIMAL else 1 for _, unit in names)
     data = [(line, row) for line, row in rows if not row.startswith("%")]
-    clocks, cells = _split(file, data, width)
-    # Time systems by the manual's appendix B: GPS time, UTC or Japan's, which is UTC + 9 h.
+    clocks, cells = _clocks_and_cells(file, data, width)
+    # Time systems (manual, appendix B): GPS time, UTC, or that of Japan, which is UTC + 9 h.
     system = TimeSystem.GPS if header[1] == "GPST" else TimeSystem.UTC
     time_s = unix_from_clock(clocks, system) - (_JST_AHEAD_S if header[1] == "JST" else 0.0)
-    kind = next((match for _, row in rows if (match := _HEIGHTS.search(row))), None)
+    datum_and_heights = next((match for _, row in rows if (match := _HEIGHTS.search(row))), None)
     return RtklibSolution(
         file.path,
         tuple(line for line, _ in data),
         time_s,
         _columns(names, cells),
-        kind[1] if kind else "",
-        kind[2] if kind else "",
+        datum_and_heights[1] if datum_and_heights else "",
+        datum_and_heights[2] if datum_and_heights else "",
     )
 
 
 def _columns(names: Sequence[tuple[str, str]], cells: FloatArray) -> dict[str, FloatArray]:
-    """Return cells (n, width) by name; degrees, minutes, seconds have one sign, at the degrees."""
+    """Return cells (n, width) by name; sexagesimal angles have their sign at the degrees."""
     columns, first = {}, 0
     for name, unit in names:
         if unit == _SEXAGESIMAL:
@@ -93,7 +93,7 @@ def _columns(names: Sequence[tuple[str, str]], cells: FloatArray) -> dict[str, F
     return columns
 
 
-def _split(
+def _clocks_and_cells(
     file: ForeignFile, data: Sequence[tuple[int, str]], width: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return clock times (n,) and cells (n, width); further cells are dropped."""
@@ -103,8 +103,8 @@ def _split(
     for index, (line, row) in enumerate(data):
         try:
             if match := _DATE.match(row):
-                clocks[index], rest = _calendar(match), row[match.end() :]
-                texts = rest.removeprefix(separator or "").split(separator)
+                clocks[index], remainder = _calendar(match), row[match.end() :]
+                texts = remainder.removeprefix(separator or "").split(separator)
             else:
                 week, seconds, *texts = row.split(separator)
                 weeks[index], clocks[index] = int(week), float(seconds)
@@ -122,9 +122,9 @@ def _split(
     in_weeks = ~np.isnan(weeks)
     if in_weeks.any():
         clocks = np.where(in_weeks, clock_from_week(weeks, clocks), clocks)
-    lost = np.flatnonzero(~(np.abs(np.column_stack((clocks, cells))) < LARGEST).all(axis=1))
-    if lost.size:
-        line = data[lost[0]][0]
+    invalid = np.flatnonzero(~(np.abs(np.column_stack((clocks, cells))) < LARGEST).all(axis=1))
+    if invalid.size:
+        line = data[invalid[0]][0]
         raise file.error_at(f"line {line}", "holds a number that is not finite", "delete it")
     return unwrap_week(clocks) if in_weeks.any() else clocks, cells
 

@@ -1,12 +1,12 @@
-"""Targets of visiona, the program of Cucci (2016): the groups target and targets of its files.
+"""Targets of visiona, the program of Cucci (2016): the groups target and targets in its files.
 
     target = { d = 0.9; id = 0.45; signalRadiusPercentage = 0.714286;
                signalStartsWith = 1.0; signal = [0.03, 0.09, …]; };
 
-d and id are the outer and the inner diameter of the black ring [m]. `signal` has the places where
-the colour changes along a circle about the centre, whose radius is signalRadiusPercentage of the
-outer one, in turns; the first piece is white (1.0) or black (-1.0). Places run clockwise as seen
-from the front, as kgcp's: the sample's drawing, whose angles run the other way, has its dots at the
+d and id are the outer and the inner diameter of the black ring [m]. `signal` has the places [turns]
+where the colour changes along a circle about the centre, whose radius is signalRadiusPercentage of
+the outer one. The first piece is white (1.0) or black (-1.0). Places run clockwise as seen from the
+front, as in kgcp. The angles of the sample's drawing run the other way, and its dots are at the
 mirrored places. Files for several targets have a list `targetModels`, each with an `id`, in a group
 `targets`.
 """
@@ -22,18 +22,18 @@ from kgcp.io.files.libconfig import load_libconfig
 from kgcp.io.files.sniff import ForeignFile, NamedValues
 from kgcp.targets.layout import Ring
 
-_SAME_SIZE = 0.1  # relative: of dots whose places are rounded to degrees
-_MOST_FLIPS = 400
+_SIZE_TOLERANCE = 0.1  # relative tolerance: places of dots are rounded to degrees
+_MAX_CHANGES = 400
 _COLOURS = {1.0: True, -1.0: False}  # signalStartsWith → whether white
 
 
 def visiona_settings(file: ForeignFile) -> NamedValues:
-    """Return the groups of a file of visiona.
+    """Return the groups in a file of visiona.
 
     Raises
     ------
     KgcpError
-        Naming the line: if it is not libconfig.
+        If it is not libconfig. The message names the line.
     """
     try:
         return NamedValues.of(file, "", load_libconfig(file.text))
@@ -44,7 +44,7 @@ def visiona_settings(file: ForeignFile) -> NamedValues:
 def read_visiona_ring(
     file: ForeignFile, name: str, model: int | None = None, sd_outer_diameter_m: float = 0.0
 ) -> Ring:
-    """Return a target of a file of visiona.
+    """Return a target from a file of visiona.
 
     Parameters
     ----------
@@ -56,8 +56,8 @@ def read_visiona_ring(
     Raises
     ------
     KgcpError
-        Naming file, group and key: if the target is not there or several are, a key is missing, or
-        the places are not those of round dots of one size on the black ring.
+        If the target is missing or ambiguous, a key is missing, or the places are not those of
+        round dots of one size on the black ring. The message names file, group and key.
     """
     size, code = _chosen(file, model)
     outer_m, inner_m = size.number("d"), size.number("id")
@@ -65,12 +65,12 @@ def read_visiona_ring(
         "signalRadiusPercentage"
     )
     centres, half_turns = _white_pieces(code)
-    spread = half_turns / half_turns.mean()
-    if spread.min() < 1.0 - _SAME_SIZE or spread.max() > 1.0 + _SAME_SIZE:
+    relative_size = half_turns / half_turns.mean()
+    if relative_size.min() < 1.0 - _SIZE_TOLERANCE or relative_size.max() > 1.0 + _SIZE_TOLERANCE:
         degrees = 720.0 * half_turns
         raise code.error(
             f"has white pieces of {degrees.min():.1f} to {degrees.max():.1f} deg",
-            "kgcp knows round dots of one size only",
+            "kgcp only reads round dots of one size",
         )
     # A round dot whose centre lies on the circle of radius r, and whose edge crosses it at ±φ, has
     # the radius 2 r sin(φ/2). The sample's author took r tan φ, which is 0.8 % more there.
@@ -86,11 +86,11 @@ def read_visiona_ring(
             sd_outer_diameter_m=sd_outer_diameter_m,
         )
     except SettingError as error:
-        raise code.error(f"is no ring with dots ({error})") from None
+        raise code.error(f"is not a ring with dots ({error})") from None
 
 
 def _chosen(file: ForeignFile, model: int | None) -> tuple[NamedValues, NamedValues]:
-    """Return the groups that have the diameters and the code of a target: often the same."""
+    """Return the groups with the diameters and with the code of a target; often the same one."""
     settings = visiona_settings(file)
     if "target" in settings and "targets" in settings:
         raise file.error("has both a group target and a group targets", "delete one of the two")
@@ -103,25 +103,25 @@ def _chosen(file: ForeignFile, model: int | None) -> tuple[NamedValues, NamedVal
         return target, target
     targets = settings.child("targets")
     listed = targets.children("targetModels")
-    models = {each.number("id"): each for each in listed}
+    models = {model_values.number("id"): model_values for model_values in listed}
     if not models or len(models) < len(listed):
         raise targets.error("does not have targetModels of different ids")
     if model is None and len(models) == 1:
         return targets, next(iter(models.values()))
     if model not in models:
-        known = ", ".join(f"{each:g}" for each in sorted(models)[:8])
+        ids = ", ".join(f"{model_id:g}" for model_id in sorted(models)[:8])
         problem = f"has no target {model}" if model is not None else "has several targets"
-        raise targets.error(f"{problem}: {known}", "choose one of them with id in flight.toml")
+        raise targets.error(f"{problem}: {ids}", "choose one of them with id in flight.toml")
     return targets, models[model]
 
 
 def _white_pieces(code: NamedValues) -> tuple[np.ndarray, np.ndarray]:
     """Return middles and half lengths of the white pieces of the circle [turns]."""
-    flips = code["signal"]
-    count = len(flips) if isinstance(flips, list) else 0
-    if not 2 <= count <= _MOST_FLIPS or count % 2:
+    changes = code["signal"]
+    count = len(changes) if isinstance(changes, list) else 0
+    if not 2 <= count <= _MAX_CHANGES or count % 2:
         problem = f"'signal' has {count} places where the colour changes"
-        raise code.error(problem, f"give an even number of them, at most {_MOST_FLIPS}")
+        raise code.error(problem, f"give an even number of them, at most {_MAX_CHANGES}")
     places = np.array(code.vector("signal", count))
     if places[0] < 0.0 or places[-1] > 1.0 or np.any(np.diff(places) <= 0.0):
         raise code.error("'signal' does not ascend from 0 to 1", "give places in turns, in order")
@@ -129,7 +129,7 @@ def _white_pieces(code: NamedValues) -> tuple[np.ndarray, np.ndarray]:
     if first not in _COLOURS:
         problem = f"'signalStartsWith' is {first:g}"
         raise code.error(problem, "give 1.0 for white or -1.0 for black")
-    # Where it begins with white, that piece is the end of the last one.
+    # If the circle begins with white, its first piece is the end of the last one.
     edges = np.append(places[1:], places[0] + 1.0) if _COLOURS[first] else places
     begins, ends = edges[::2], edges[1::2]
     return np.mod(0.5 * (begins + ends), 1.0), 0.5 * (ends - begins)

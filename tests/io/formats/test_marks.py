@@ -32,7 +32,7 @@ def test_frames_may_be_named_with_backslashes(tmp_path: Path) -> None:
         ("a/f.png,A,1,1,3\n", "has one mark"),
         (SOUND + "b/f.png,A,1,1,3\nb/f.png,B,1,1,3\n", "two marks at one place"),
         (SOUND + ".\\a\\f.png,A,7,7,3\n", "line 4: 'A' is marked twice"),
-        (SOUND + "f.png,A,1,1,3\n", "line 4: 'f.png' is no frame"),
+        (SOUND + "f.png,A,1,1,3\n", "line 4: 'f.png' is not a frame"),
         (SOUND + "b/f.png,C,1,1,3\n", "line 4: 'C' is not a static target"),
         (SOUND + "b/f.png,A,480,1,3\n", r"line 4: \(480, 1\) is outside the frame"),
         (SOUND + "b/f.png,A,1,-0.1,3\n", "line 4: .* is outside the frame"),

@@ -100,7 +100,7 @@ def test_files_may_have_several_targets(read: Read) -> None:
         (PAPER, "id = 1", "has one target only, without an id; delete id from flight.toml"),
         (PAPER, "code_deg = [0, 90]", "code_deg: is given beside a file; delete one of the two"),
         (PAPER, "sd_outer_diameter_m = -1", "sd_outer_diameter_m: -1 m is out of range"),
-        (PAPER.replace("0.9;", "0.4;"), "", "target: is no ring with dots (inner_diameter_m: 0.45"),
+        (PAPER.replace("0.9;", "0.4;"), "", "is not a ring with dots (inner_diameter_m: 0.45"),
         (PAPER.replace("id = 0.45;", ""), "", "target: has no 'id'; correct the file"),
         (
             PAPER.replace("0.031884, ", ""),

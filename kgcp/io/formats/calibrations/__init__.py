@@ -1,8 +1,8 @@
 """Camera calibrations as other programs write them, one module per format.
 
-A module offers `matches(file)`, whether a file's content is of its format, and `entries(file)`,
-the cameras in it, and has one line in `FORMATS`. `entries` raises `KgcpError`, which names the
-line or element, for a file that is not as its format says.
+Each module has one line in `FORMATS` and offers two functions. `matches(file)` says whether the
+content has its format, `entries(file)` returns its cameras. `entries` raises `KgcpError`, which
+names the line or element, if a file does not follow its format.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ FORMATS: Registry[Callable[[ForeignFile], Sequence[Entry]]] = Registry(
 
 @dataclass(frozen=True, slots=True)
 class ErrorWords:
-    """What errors say about a calibration file, by where it is named."""
+    """Wording of errors about a calibration file, depending on what names the file."""
 
     named_by: str  # the key or option that names the file
     other_size: str  # what its frame size contradicts
@@ -81,20 +81,20 @@ def read_calibration(
     Parameters
     ----------
     stated_size : tuple of int or None
-        Width and height [px] that are known beside the file: needed where the file is silent, else
-        they must agree.
+        Width and height [px] that are known from elsewhere. They are needed if the file has none;
+        otherwise they must agree.
     form : str or None
         Name of the format; None: the content tells.
     camera : str or None
         Name of the camera where the file has several.
     words : ErrorWords
-        Of errors.
+        Wording of errors.
 
     Raises
     ------
     KgcpError
         If the file is missing, is of no known format, lacks the size or the camera, or holds a
-        model that `Camera` cannot represent exactly; it names the term.
+        model that `Camera` cannot represent exactly. The message names the term.
     """
     file = ForeignFile(path, words.named_by)
     read = replace(FORMATS, remedy=words.other_format).reader(file, form)
@@ -126,9 +126,9 @@ def _chosen(
     return chosen[0]
 
 
-def _listed(names: Sequence[str], most: int = 8) -> str:
-    shown = ", ".join(repr(name) for name in names[:most])
-    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+def _listed(names: Sequence[str], max_names: int = 8) -> str:
+    shown = ", ".join(repr(name) for name in names[:max_names])
+    return shown if len(names) <= max_names else f"{shown} and {len(names) - max_names} more"
 
 
 def _agreed_size(
@@ -151,9 +151,9 @@ def _agreed_size(
     return size
 
 
-def _same_shape(size: tuple[int, int], found: tuple[int, int]) -> bool:
+def _same_shape(size: tuple[int, int], file_size: tuple[int, int]) -> bool:
     """Whether one size is the other resized, its shorter side rounded to whole pixels."""
-    scale = max(size) / max(found)
-    return (size[0] < size[1]) == (found[0] < found[1]) and abs(
-        min(size) - min(found) * scale
+    scale = max(size) / max(file_size)
+    return (size[0] < size[1]) == (file_size[0] < file_size[1]) and abs(
+        min(size) - min(file_size) * scale
     ) <= max(scale, 1.0)

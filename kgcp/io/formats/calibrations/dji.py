@@ -27,8 +27,8 @@ def matches(file: ForeignFile) -> bool:
 
 def entries(file: ForeignFile) -> tuple[Entry, ...]:
     """Return the one camera."""
-    found = _TAG.search(file.text) or _BARE.fullmatch(file.text.strip())
-    if found is None:
+    dewarp_data = _TAG.search(file.text) or _BARE.fullmatch(file.text.strip())
+    if dewarp_data is None:
         raise file.error("has no DewarpData", "name an image as the camera wrote it")
     flag = _FLAG.search(file.text)
     if flag is not None and flag[1].strip("0"):
@@ -36,7 +36,7 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
             "is dewarped already (DewarpFlag), so that its DewarpData describes another image",
             "switch dewarping off in the camera, or calibrate these images",
         )
-    numbers = found[1].rpartition(";")[2].replace(",", " ")
+    numbers = dewarp_data[1].rpartition(";")[2].replace(",", " ")
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = file.numbers(numbers, 9, "DewarpData")
 
     def convert(width: int, height: int) -> Camera:

@@ -35,12 +35,12 @@ def matches(file: ForeignFile) -> bool:
 
 
 def entries(file: ForeignFile) -> tuple[Entry, ...]:
-    """Return the cameras: of a cameras XML the adjusted ones, named by label, or id if need be."""
+    """Return the cameras. Those of a cameras XML are adjusted ones, named by label or else id."""
     if file.root is None:
         raise file.error("is not XML", "export it from Metashape again")
     if file.root.tag == "calibration":
         return (_entry(file, "", file.root),)
-    found: list[Entry] = []
+    cameras: list[Entry] = []
     sensors = file.root.findall(".//sensors/sensor")
     labels = [sensor.get("label") for sensor in sensors]
     is_labelled = all(labels) and len(set(labels)) == len(labels)
@@ -48,8 +48,8 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
         name = sensor.get("label" if is_labelled else "id") or ""
         calibrations = sensor.findall("calibration")
         adjusted = [element for element in calibrations if element.get("class") == "adjusted"]
-        found += [_entry(file, name, element) for element in (adjusted or calibrations)[:1]]
-    return tuple(found)
+        cameras += [_entry(file, name, element) for element in (adjusted or calibrations)[:1]]
+    return tuple(cameras)
 
 
 def _entry(file: ForeignFile, name: str, element: Element) -> Entry:

@@ -1,6 +1,6 @@
 """MicMac's MMVII: the internal calibration of a perspective camera, in XML.
 
-With normalised coordinates X, Y and r² = X² + Y², the file itself notes its terms' displacements:
+With normalised coordinates X, Y and r² = X² + Y², the file itself states the displacements:
 
     K1 (X, Y) r² + K2 (X, Y) r⁴ + K3 (X, Y) r⁶
     p1 (3 X² + Y², 2 X Y) + p2 (2 X Y, X² + 3 Y²) + b1 (X, 0) + b2 (Y, 0)
@@ -34,13 +34,13 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
     """Return the cameras, by their names."""
     if file.root is None:
         raise file.error("is not XML", "export it from MMVII again")
-    found = []
+    cameras = []
     for element in file.root.iter("InternalCalibration"):
         name = _text(element, "Name")
         width, height = file.numbers(element.findtext("PixelFrame/NbPix"), 2, f"{name} NbPix")
         convert = partial(_camera, file, name, element)
-        found.append(Entry(name, (int(width), int(height)), convert))
-    return tuple(found)
+        cameras.append(Entry(name, (int(width), int(height)), convert))
+    return tuple(cameras)
 
 
 def _camera(file: ForeignFile, name: str, element: Element, width: int, height: int) -> Camera:
@@ -53,8 +53,8 @@ def _camera(file: ForeignFile, name: str, element: Element, width: int, height: 
     for group in element.findall("Distorsion/*"):
         for term in group:
             (terms[term.tag],) = file.numbers(term.text, 1, f"{name} {term.tag}")
-    others = [tag for tag in terms if tag not in _TERMS]
-    refuse_terms(file, name, others, [terms[tag] for tag in others])
+    foreign_terms = [tag for tag in terms if tag not in _TERMS]
+    refuse_terms(file, name, foreign_terms, [terms[tag] for tag in foreign_terms])
     return Camera(
         width,
         height,

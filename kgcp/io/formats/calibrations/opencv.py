@@ -19,7 +19,7 @@ from kgcp.io.formats.calibrations.entry import Entry, unsupported
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-# How OpenCV's own samples and users' scripts name the values, in small letters without "_".
+# Names of the values in OpenCV's own samples and users' scripts, in lower case without "_".
 _MATRIX_KEYS = ("cameramatrix", "intrinsicmatrix", "k", "m1", "mtx")
 _DISTORTION_KEYS = (
     *("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff"),
@@ -28,7 +28,7 @@ _DISTORTION_KEYS = (
 _WIDTH_KEYS = ("imagewidth", "width")
 _HEIGHT_KEYS = ("imageheight", "height")
 
-_MOST_NUMBERS = 100  # in a matrix
+_MAX_NUMBERS = 100  # in a matrix
 _PROBLEM, _REMEDY = "is not an OpenCV FileStorage of a camera", "write it again with OpenCV"
 
 
@@ -63,17 +63,17 @@ def opencv_entry(
 
 
 def _nodes(file: ForeignFile) -> Mapping[object, object]:
-    """Return what stands at the top of a FileStorage.
+    """Return the nodes at the top of a FileStorage.
 
-    OpenCV's own parsers are not asked: a damaged file may end the process in them, or worse.
+    OpenCV's own parsers are not used: with a damaged file they may end the process, or worse.
     """
     if file.root is not None:
         return {child.tag: _element(child) for child in file.root}
     if isinstance(file.document, dict):
         return file.document
-    head, _, rest = file.text.partition("\n")
+    head, _, body = file.text.partition("\n")
     try:
-        nodes = load_yaml(rest if head.startswith("%YAML") else file.text)
+        nodes = load_yaml(body if head.startswith("%YAML") else file.text)
     except ValueError as error:
         raise file.error(f"{_PROBLEM} ({error})", _REMEDY) from error
     if not isinstance(nodes, dict):
@@ -95,7 +95,7 @@ def _matrix(nodes: Mapping[str, object], names: Sequence[str]) -> list[list[floa
         raise TypeError("no matrix")
     rows, columns = int(node["rows"]), int(node["cols"])
     data = node["data"]
-    if len(data) != rows * columns or len(data) > _MOST_NUMBERS:
+    if len(data) != rows * columns or len(data) > _MAX_NUMBERS:
         raise ValueError("rows and columns are not those of its data")
     values = [_finite(value) for value in data]
     return [values[row * columns : (row + 1) * columns] for row in range(rows)]

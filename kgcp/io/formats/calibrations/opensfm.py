@@ -1,7 +1,7 @@
 """Cameras of OpenSfM and OpenDroneMap: cameras.json, camera_models(_overrides).json.
 
-By OpenSfM's geometry.rst and io.py: lengths are in units of the frame's longer side, so that they
-hold for the original frames where width and height are those of resized ones; the principal point
+By OpenSfM's geometry.rst and io.py: lengths are in units of the frame's longer side. So they hold
+for the original frames even if width and height are those of resized ones. The principal point
 counts from the frame's middle, ((w − 1)/2, (h − 1)/2) px from the centre of the top-left pixel;
 k1, k2, k3, p1, p2 are OpenCV's. A reconstruction.json holds such cameras, too.
 """
@@ -44,10 +44,10 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
         groups = [part.child("cameras") for part in parts]
     else:
         groups = [NamedValues.of(file, "", file.document)]
-    found = {key: group.child(key) for group in groups for key in group.values}
+    cameras = {key: group.child(key) for group in groups for key in group.values}
     return tuple(
         Entry(name, _size(camera), partial(_camera, camera), is_relative=True)
-        for name, camera in found.items()
+        for name, camera in cameras.items()
     )
 
 
@@ -61,9 +61,9 @@ def _camera(camera: NamedValues, width: int, height: int) -> Camera:
     model = camera.text("projection_type")
     if model not in _TERMS:
         raise unsupported(camera.file, f"the projection_type {model!r}", camera.where)
-    longer = max(width, height)
+    longer_side_px = max(width, height)
     terms: dict[str, Any] = {term: camera.number(term, 0.0) for term in _TERMS[model]}
-    fx, fy, cx, cy = (longer * length for length in _matrix(camera, model))
+    fx, fy, cx, cy = (longer_side_px * length for length in _matrix(camera, model))
     x, y = cx + 0.5 * (width - 1), cy + 0.5 * (height - 1)
     return Camera(width, height, fx, fy, x, y, **terms)
 

@@ -32,7 +32,7 @@ def matches(file: ForeignFile) -> bool:
 
 
 def entries(file: ForeignFile) -> tuple[Entry, ...]:
-    """Return the cameras: of the text one per set of parameters, named by its first image."""
+    """Return the cameras; in the text, one per set of parameters, named by its first image."""
     if _CAM_HEAD.match(file.text):
         blocks = _CAM_HEAD.split(file.text)[1:]
         return tuple(

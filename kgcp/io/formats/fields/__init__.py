@@ -1,8 +1,8 @@
 """Boards of other programs, one module per format.
 
-A module offers `matches(file)`, whether a file's content is of its format, and
-`field(file, unit_m)`, the board in it, and has one line in `FORMATS`. Where a file does not say in
-which unit it counts, `unit_m` must; others ignore it.
+Each module has one line in `FORMATS` and offers two functions. `matches(file)` says whether the
+content has its format, `field(file, unit_m)` returns its board. `unit_m` is needed if the format
+does not state the unit; other formats ignore it.
 """
 
 from __future__ import annotations

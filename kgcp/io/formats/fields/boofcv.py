@@ -1,6 +1,6 @@
 """BoofCV's calibration_target.yaml: CIRCLE_GRID and CIRCLE_HEXAGONAL.
 
-Its numbers have the unit that whoever printed the target chose, and does not say.
+Its numbers are in the unit chosen for printing the target, which the file does not state.
 """
 
 from __future__ import annotations

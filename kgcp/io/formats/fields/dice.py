@@ -2,7 +2,7 @@
 
 Seen from the front, x runs right and y up. The origin's mark is `cal_origin_x`, `cal_origin_y` dots
 from the lower left corner; the other two are along x and y, and their distances count both ends.
-Lengths are millimetres. The file does not say how large the dots are.
+Lengths are millimetres. The file does not state the diameter of the dots.
 """
 
 from __future__ import annotations

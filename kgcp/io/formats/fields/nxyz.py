@@ -1,7 +1,7 @@
 """Lists of points as AICON, MicMac and others write them: name, x, y, z and perhaps deviations.
 
-White space, commas or semicolons separate them, and a line of words may stand first. Three
-deviations of 0 say nothing. Such a list says neither its unit nor how large the discs are.
+White space, commas or semicolons separate them. The first line may be a heading. Three deviations
+of 0 mean none. Such a list states neither its unit nor the diameter of the discs.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from kgcp.targets.fields.points import MOST_DISCS, FieldPoint, PointField, gaps_
 _SEPARATORS = re.compile(r"[\s,;]+")
 _COMMENTS = ("#", "!", "%", "//")
 _DISC = 0.3  # of the distance of neighbours: assumed diameter until it is measured
-_LARGEST_DISC = 0.5  # of the least distance
-_HEAD = 4096  # characters that tell the format
+_MAX_DISC = 0.5  # of the smallest distance
+_HEAD = 4096  # characters by which the format is recognised
 _COUNTS = (4, 7)  # cells in a row: without and with deviations
 
 
 def matches(file: ForeignFile) -> bool:
     """Whether the first lines are names with three or six numbers."""
     lines = file.text[:_HEAD].splitlines()
-    whole = lines[:-1] if len(file.text) > _HEAD else lines
-    rows = _below_heading(list(_cells(enumerate(whole, 1))))
+    complete_lines = lines[:-1] if len(file.text) > _HEAD else lines
+    rows = _below_heading(list(_cells(enumerate(complete_lines, 1))))
     return len(rows) >= LEAST_POINTS and all(_is_point(cells) for _, cells in rows)
 
 
@@ -51,12 +51,12 @@ def field(file: ForeignFile, unit_m: float | None) -> PointField:
         raise file.error("has no points", "name a list of name, x, y, z")
     values = unit_m * np.array([[float(cell) for cell in cells[1:4]] for _, cells in rows])
     gaps_m = gaps_between(values).min(axis=1)
-    pitch_m, least_m = float(np.median(gaps_m)), float(gaps_m.min())
+    pitch_m, min_gap_m = float(np.median(gaps_m)), float(gaps_m.min())
     if not 0.0 < pitch_m < math.inf:
         raise file.error("has points at one place", "repair it")
     diameter_m = _DISC * pitch_m
-    if least_m > 0.0:  # two at one place overlap, whatever their diameter
-        diameter_m = min(diameter_m, _LARGEST_DISC * least_m)
+    if min_gap_m > 0.0:  # two discs at one place overlap whatever their diameter
+        diameter_m = min(diameter_m, _MAX_DISC * min_gap_m)
     points = []
     for (_, cells), place in zip(rows, values.tolist(), strict=True):
         sds = [unit_m * float(cell) for cell in cells[4:7]]

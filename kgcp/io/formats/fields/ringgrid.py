@@ -1,8 +1,8 @@
 """ringgrid's target.json: rings on a hexagonal or square lattice, plain or with sectors as codes.
 
 Schemas v4 and v5. Lengths are millimetres. The pitch of its hexagonal lattices is the radius of the
-hexagons around the rings: neighbours are √3 of it apart. The rings get their names from the
-lattice; codes and the dots beside the origin are not read.
+hexagons around the rings: neighbours are √3 times the pitch apart. The rings are named by their
+place in the lattice; codes and the dots beside the origin are not read.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from kgcp.targets.fields.layout import Field, GridKind, Mark
 
 _SCHEMAS = ("ringgrid.target.v4", "ringgrid.target.v5")
 _MM = 0.001
-_MOST = 1000  # rows, and rings in a row
+_MAX_COUNT = 1000  # of rows, and of rings in a row
 
 
 def matches(file: ForeignFile) -> bool:
@@ -45,7 +45,7 @@ def field(file: ForeignFile, unit_m: float | None) -> Field:  # noqa: ARG001 - a
     sizes_m = (2.0 * _MM * outer_mm, 2.0 * _MM * inner_mm)
     name, pitch_m = board.text("name")[:100], _MM * lattice.number("pitch_mm")
     if not name.strip() or not name.isprintable():
-        name = file.path.stem  # no field.toml could hold it
+        name = file.path.stem  # a field.toml cannot hold such a name
     rows = _count(lattice, "rows")
     kind = "hex" if is_flat else lattice.text("kind")
     if kind == "rect":
@@ -68,11 +68,12 @@ def field(file: ForeignFile, unit_m: float | None) -> Field:  # noqa: ARG001 - a
 
 
 def _hexagonal(rows: int, longest: int, diameter_m: float) -> tuple[int, tuple[Mark, ...]]:
-    """Return columns as kgcp counts them, and the places that are empty.
+    """Return the number of columns in kgcp's sense, and the places that are empty.
 
-    Rows have `longest` rings and one less in turn, by ringgrid's rule counted from the middle row.
-    kgcp counts half-steps from the last row, which begins at the first. If that is a short one, the
-    board lies in one that is a step wider, with the ends of every short row missing.
+    Rows alternately have `longest` rings and one less, by ringgrid's rule counted from the middle
+    row. kgcp counts half-steps from the last row, which begins at the first. If the last row is a
+    short one, the board is described as one that is a step wider, in which both ends of every short
+    row are missing.
     """
 
     def is_long(row: int) -> bool:
@@ -87,6 +88,6 @@ def _hexagonal(rows: int, longest: int, diameter_m: float) -> tuple[int, tuple[M
 
 def _count(lattice: NamedValues, key: str) -> int:
     count = lattice.number(key)
-    if count != int(count) or not 2 <= count <= _MOST:
-        raise lattice.error(f"{key!r} is {count:g}", f"print a board with 2 to {_MOST}")
+    if count != int(count) or not 2 <= count <= _MAX_COUNT:
+        raise lattice.error(f"{key!r} is {count:g}", f"print a board with 2 to {_MAX_COUNT}")
     return int(count)

@@ -1,7 +1,7 @@
 """The cal_data.yaml of ROS-Industrial's industrial_calibration, with a modified circle grid.
 
 One dot is larger than the others: the origin, in the lower left corner. Lengths are metres. The
-file does not say how large the dots are.
+file does not state the diameter of the dots.
 """
 
 from __future__ import annotations

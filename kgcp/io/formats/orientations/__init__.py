@@ -1,8 +1,8 @@
 """Readers of the camera's reference poses, one module per format.
 
-A module offers `matches(file)`, whether a file's content is of its format, and `poses(file)`, what
-stands in it, and has one line in `FORMATS`. `poses` raises `KgcpError`, which names the line or
-element, for a file that is not as its format says.
+Each module has one line in `FORMATS` and offers two functions. `matches(file)` says whether the
+content has its format, `poses(file)` returns its poses. `poses` raises `KgcpError`, which names the
+line or element, if a file does not follow its format.
 """
 
 from __future__ import annotations
@@ -47,16 +47,16 @@ def read_reference_poses(
     options : OrientationFileOptions or None
         What flight.toml says about the file; None: nothing.
     crs : str or None
-        The flight's, in which the poses are returned; it may be None where the file's coordinates
-        are the flight's.
+        The flight's, in which the poses are returned. It may be None if the file's coordinates are
+        the flight's.
     frames : sequence of str
-        Of the flight: other programs know them by their file names alone.
+        Of the flight: other programs may only have their file names.
 
     Raises
     ------
     KgcpError
-        Naming the file, the element in it and the remedy: if it is missing, of no known format,
-        incomplete, not georeferenced, or in a CRS from which no way leads to the flight's.
+        If the file is missing, of no known format, incomplete, not georeferenced, or in a CRS that
+        cannot be transformed to the flight's. The message names file, element and remedy.
     """
     options = options or OrientationFileOptions()
     file = ForeignFile(path, "[reference] poses")

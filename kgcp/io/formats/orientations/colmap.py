@@ -2,8 +2,8 @@
 
 By COLMAP's doc/format.rst: two lines per image, `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME` and
 its points, which may be an empty line. The quaternion (Hamilton, w first) and the translation lead
-from the world to the camera (x right, y down, z forward), whose centre is −Rᵀ t; of rigs, too,
-each image has its own. The world is not a map; after aligning it to one, flight.toml may name that.
+from the world to the camera (x right, y down, z forward), whose centre is −Rᵀ t. Each image has its
+own pose, also in rigs. The world is not a map. If it is aligned to one, flight.toml may name it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.orientations.records import SourcePoses, photo_rotations
 
-_SHORTEST = 1e-6  # of quaternions, which should have the length 1
+_MIN_NORM = 1e-6  # of quaternions, which should be unit ones
 _LINE = re.compile(r"\d+(\s+[-+.\deE]+){7}\s+\d+\s+(\S.*)")
 
 
@@ -40,7 +40,7 @@ def poses(file: ForeignFile) -> SourcePoses:
             )
         *numbers, _, name = row.split(maxsplit=9)
         _, w, x, y, z, *translation = file.numbers(" ".join(numbers), 8, where)
-        if math.hypot(w, x, y, z) < _SHORTEST:
+        if math.hypot(w, x, y, z) < _MIN_NORM:
             raise file.error_at(where, "has an invalid quaternion (norm ≈ 0)")
         world_from_camera = np.asarray(Rotation.from_quat([x, y, z, w]).as_matrix()).T
         names.append(name.strip())
@@ -56,7 +56,7 @@ def poses(file: ForeignFile) -> SourcePoses:
 
 
 def _image_rows(file: ForeignFile) -> list[tuple[int, str]]:
-    """Return every other line; those of the points count even where they are empty."""
+    """Return every other line; those of points count even if they are empty."""
     lines = list(enumerate(file.text.splitlines(), start=1))
     rows = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
     return [(number, line.strip()) for number, line in rows[::2] if line.strip()]

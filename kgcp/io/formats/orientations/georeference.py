@@ -1,4 +1,4 @@
-"""From the frame of a file of poses to the flight's map."""
+"""Transformation of poses from the frame of their file to the flight's map."""
 
 from __future__ import annotations
 
@@ -42,27 +42,32 @@ def on_the_map(
     Raises
     ------
     KgcpError
-        If the coordinates are in no known map, flight.toml names one for a file that names
-        its own, no exact way leads from there to the flight's CRS, or a pose lies far from
-        the Earth's surface.
+        If the coordinates are in no known map, if flight.toml names a CRS though the file has its
+        own, if that cannot be transformed exactly to the flight's CRS, or if a pose is higher than
+        `MAX_HEIGHT`.
     """
-    placed = _placed(file, _shifted(file, source, options), options.crs)
-    if placed.crs is not None and not _is_same(placed.crs, crs):
+    georeferenced = _placed(file, _shifted(file, source, options), options.crs)
+    if georeferenced.crs is not None and not _is_same(georeferenced.crs, crs):
         where = f"{file.path}: crs" if options.crs is None else REFERENCE_CRS
-        placed = _moved(file, placed, LocalFrame.at(placed.crs, placed.position[0], where), crs)
-    high = np.flatnonzero(np.abs(placed.position[:, 2]) > MAX_HEIGHT)
-    if high.size:
+        georeferenced = _on_flight_map(
+            file,
+            georeferenced,
+            LocalFrame.at(georeferenced.crs, georeferenced.position[0], where),
+            crs,
+        )
+    too_high = np.flatnonzero(np.abs(georeferenced.position[:, 2]) > MAX_HEIGHT)
+    if too_high.size:
         raise file.error_at(
-            f"pose of {source.names[high[0]]!r}",
-            f"has a height of {placed.position[high[0], 2]:.0f}",
+            f"pose of {source.names[too_high[0]]!r}",
+            f"has a height of {georeferenced.position[too_high[0], 2]:.0f}",
             "correct [reference] crs, that of the file's coordinates",
         )
     return ReferencePoses(
         frames=frames,
-        position_map=placed.position,
-        opk_deg=opk_from_rotation(placed.frame_from_photo).reshape(-1, 3),
-        sd_position_m=placed.sd_position_m,
-        sd_angle_deg=placed.sd_angle_deg,
+        position_map=georeferenced.position,
+        opk_deg=opk_from_rotation(georeferenced.frame_from_photo).reshape(-1, 3),
+        sd_position_m=georeferenced.sd_position_m,
+        sd_angle_deg=georeferenced.sd_angle_deg,
     )
 
 
@@ -84,7 +89,8 @@ def _shifted(
 def read_offset(path: Path) -> FloatArray:
     """Return what was subtracted from coordinates (3,): Pix4D's offset.xyz, ODM's coords.txt.
 
-    It is the first line of two or three numbers alone; without a third, heights are whole.
+    It is the first line of only two or three numbers. Without a third, nothing was subtracted from
+    heights.
 
     Raises
     ------
@@ -99,12 +105,12 @@ def read_offset(path: Path) -> FloatArray:
     raise file.error("has no line of two or three numbers", "give the project's offset file")
 
 
-def _placed(file: ForeignFile, source: SourcePoses, stated: str | None) -> SourcePoses:
-    """Return the poses with the CRS of their coordinates; None: the flight's."""
-    if stated is not None:
+def _placed(file: ForeignFile, source: SourcePoses, stated_crs: str | None) -> SourcePoses:
+    """Return the poses with the CRS of their coordinates; None stands for the flight's."""
+    if stated_crs is not None:
         if source.crs is not None:
             raise file.error("names its CRS already", "delete [reference] crs")
-        return _stated(source, stated)
+        return _in_stated_crs(source, stated_crs)
     if source.unreferenced is not None and source.crs is None:
         raise file.error(source.unreferenced, _REMEDY)
     if source.level is not None:
@@ -112,8 +118,8 @@ def _placed(file: ForeignFile, source: SourcePoses, stated: str | None) -> Sourc
     return source
 
 
-def _stated(source: SourcePoses, crs: str) -> SourcePoses:
-    """Return poses whose coordinates are of a CRS that flight.toml states."""
+def _in_stated_crs(source: SourcePoses, crs: str) -> SourcePoses:
+    """Return poses whose coordinates are in a CRS that flight.toml states."""
     parsed = parse_crs(crs, REFERENCE_CRS)
     if parsed.is_geocentric:
         return from_geocentric(
@@ -121,7 +127,7 @@ def _stated(source: SourcePoses, crs: str) -> SourcePoses:
         )
     if parsed.is_geographic and source.unreferenced is not None:
         raise KgcpError(
-            f"{REFERENCE_CRS} {crs!r} counts degrees, but the poses are in a Cartesian frame;"
+            f"{REFERENCE_CRS} {crs!r} is in degrees, but the poses are in a Cartesian frame;"
             " give the projected or geocentric CRS that they are aligned to"
         )
     return replace(source, crs=crs, level=None)
@@ -134,23 +140,23 @@ def _is_same(crs: str, flight_crs: str | None) -> bool:
     )
 
 
-def _moved(
+def _on_flight_map(
     file: ForeignFile, source: SourcePoses, local_frame: LocalFrame, crs: str | None
 ) -> SourcePoses:
-    """Bring poses from their map, that of `local_frame`, to the flight's."""
+    """Transform poses from the map of `local_frame` to the flight's."""
     if crs is None:
         raise file.error(
-            "has coordinates of its own CRS, but flight.toml has none",
+            "has coordinates in its own CRS, but flight.toml names none",
             'name the flight\'s, for example crs = "EPSG:25831"',
         )
     transform = CrsTransform.to(crs, local_frame, source.position[0], CRS_KEY)
-    turn = np.array([transform.axes(point) for point in source.position])
+    flight_from_source = np.array([transform.axes(point) for point in source.position])
     sd = source.sd_position_m
-    if sd is not None:  # the axes turn; what correlates then is left out
-        sd = np.sqrt(np.einsum("nij,nj->ni", turn**2, sd**2))
+    if sd is not None:  # the axes turn; the resulting covariances are left out
+        sd = np.sqrt(np.einsum("nij,nj->ni", flight_from_source**2, sd**2))
     return replace(
         source,
         position=transform.positions(source.position),
-        frame_from_photo=turn @ source.frame_from_photo,
+        frame_from_photo=flight_from_source @ source.frame_from_photo,
         sd_position_m=sd,
     )

@@ -3,8 +3,8 @@
 By its exports and scripts: a camera's <transform> (4 × 4, row by row) leads from the camera (x
 right, y down, z forward) to the chunk, and the <transform> of its component or of the chunk, with
 rotation, translation and scale, from there to the world: geocentric where the chunk's <reference>
-is a CRS of the Earth (heights are then ellipsoidal, whatever it says of them), else its local
-coordinates. Cameras without a transform are not aligned, and left out.
+is a CRS of the Earth, else its local coordinates. In the former case heights are ellipsoidal,
+whatever the CRS says of them. Cameras without a transform are not aligned and are left out.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ def poses(file: ForeignFile) -> SourcePoses:
         matrix = np.array(file.numbers(text, 16, f"{where} transform")).reshape(4, 4)
         require_rotation(file, where, matrix[:3, :3])
         centre, rotation = matrix[:3, 3], matrix[:3, :3] @ CAMERA_FROM_PHOTO
-        way = to_world.get(camera.get("component_id", ""), chunk_to_world)
-        if way is None:
+        similarity = to_world.get(camera.get("component_id", ""), chunk_to_world)
+        if similarity is None:
             is_in_world = False
         else:
-            centre = way.scale * way.rotation @ centre + way.translation
-            rotation = way.rotation @ rotation
+            centre = similarity.scale * similarity.rotation @ centre + similarity.translation
+            rotation = similarity.rotation @ rotation
         names.append(camera.get("label") or "")
         centres.append(centre)
         rotations.append(rotation)
@@ -73,12 +73,12 @@ def poses(file: ForeignFile) -> SourcePoses:
     geodetic = _geodetic(file, chunk)
     if is_in_world and geodetic is not None:
         return from_geocentric(tuple(names), position, frame_from_photo, geodetic)
-    why = (
+    problem = (
         "is in local coordinates"
         if geodetic is None
         else "has cameras without a transform to the world"
     )
-    return SourcePoses(tuple(names), position, frame_from_photo, unreferenced=why)
+    return SourcePoses(tuple(names), position, frame_from_photo, unreferenced=problem)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -30,7 +30,7 @@ def matches(file: ForeignFile) -> bool:
 
 
 def poses(file: ForeignFile) -> SourcePoses:
-    """Return the poses, in the UTM zone that the file is in."""
+    """Return the poses, in the UTM zone of the file."""
     features = NamedValues.of(file, "", file.document).children("features")
     properties = [feature.child("properties") for feature in features]
     centre = vectors(properties, "translation")
@@ -46,15 +46,15 @@ def poses(file: ForeignFile) -> SourcePoses:
 
 
 def _zone(file: ForeignFile, points: FloatArray, centre: FloatArray) -> str:
-    """Return the UTM zone of WGS 84 that leads from the points to the centres."""
+    """Return the UTM zone of WGS 84 in which the points have the coordinates of the centres."""
     longitude, latitude = points[:1, 0], points[:1, 1]
     middle = int(np.floor((longitude[0] + 180.0) / 6.0)) if points.size else 0
     for zone in ((middle + step) % 60 + 1 for step in (0, -1, 1, -2, 2)):
         for family in (326, 327):
             crs = f"EPSG:{family}{zone:02d}"
             utm = Transformer.from_crs("EPSG:4326", crs, always_xy=True)
-            found = np.column_stack(utm.transform(points[:, 0], points[:, 1]))
-            if np.all(np.abs(found - centre[:, :2]) < _ZONE_TOLERANCE_M):
+            projected = np.column_stack(utm.transform(points[:, 0], points[:, 1]))
+            if np.all(np.abs(projected - centre[:, :2]) < _ZONE_TOLERANCE_M):
                 return crs
     raise file.error(
         f"has translations that fit no UTM zone near {longitude[0]:.4f}, {latitude[0]:.4f}",

@@ -2,7 +2,7 @@
 
 By OpenSfM's io.py and geometry.rst: a list of reconstructions, whose shots have a rotation (axis
 times angle) and a translation from the world to the camera (x right, y down, z forward); its
-centre is −Rᵀ t. The world is east, north, up over `reference_lla` (WGS 84), which stands in the
+centre is −Rᵀ t. The world is east, north, up over `reference_lla` (WGS 84), which is in the
 file or in reference_lla.json beside it.
 
 OpenDroneMap overwrites the file with UTM coordinates less an offset, and keeps the original as
@@ -60,12 +60,12 @@ def _unreferenced(file: ForeignFile, level: LocalFrame | None) -> str | None:
 
 
 def _level(file: ForeignFile, parts: Sequence[NamedValues]) -> LocalFrame | None:
-    """Return the frame over the reference; None without one."""
+    """Return the ENU frame at the reference; None without a reference."""
     references = [part.child("reference_lla") for part in parts if part.values.get("reference_lla")]
     beside = file.path.parent / _REFERENCE
     if not references and beside.is_file():
-        other = ForeignFile(beside, "[reference] poses")
-        references = [NamedValues.of(other, "", other.document)]
+        reference_file = ForeignFile(beside, "[reference] poses")
+        references = [NamedValues.of(reference_file, "", reference_file.document)]
     origins = {_lla(reference) for reference in references}
     if len(origins) > 1:
         raise file.error(

@@ -1,9 +1,10 @@
 """The Open Photogrammetry Format: calibrated_cameras.json, or the project that names it.
 
-By opf-spec: positions are in the canonical frame, which the scene reference frame makes of its
-base CRS: axes scaled to be isometric, x and y swapped if the CRS has northing first, shifted.
-orientation_deg is ω, φ, κ of docs/conventions.md relative to that frame's axes. Image names stand
-in the camera list. A constant geoid_height leads from the heights to ellipsoidal ones.
+By opf-spec: positions are in the canonical frame. The scene reference frame derives it from its
+base CRS: axes are scaled to be isometric, x and y are swapped if the CRS has northing first, and
+the origin is shifted. orientation_deg is ω, φ, κ of docs/conventions.md relative to that frame's
+axes. Image names are in the camera list. A constant geoid_height leads from heights to ellipsoidal
+ones.
 """
 
 from __future__ import annotations
@@ -55,8 +56,8 @@ def poses(file: ForeignFile) -> SourcePoses:
 
 def _kind(file: ForeignFile) -> str:
     """Return the kind that an OPF file states; empty for other files."""
-    said = file.document.get("format") if isinstance(file.document, dict) else None
-    word = said if isinstance(said, str) else ""
+    stated = file.document.get("format") if isinstance(file.document, dict) else None
+    word = stated if isinstance(stated, str) else ""
     return word.removeprefix("application/opf-").removesuffix("+json")
 
 
@@ -95,10 +96,10 @@ def _names(cameras: NamedValues) -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scene:
-    """The way from the canonical frame to the map; crs None: to a frame that is not a map.
+    """The transformation from the canonical frame to the map; crs None: that is not a map.
 
-    Heights z of the base become (z + geoid_height) · height_factor: ellipsoidal and in metres
-    where the CRS does not define its own, or OPF gives it a constant geoid.
+    Heights z of the base become (z + geoid_height) · height_factor. They are then ellipsoidal and
+    in metres if the CRS does not define its own, or if OPF gives it a constant geoid.
     """
 
     crs: str | None
@@ -117,7 +118,7 @@ class _Scene:
             If something is missing, a scale is not positive, or the CRS is not projected or has
             axes that OPF's swapping does not bring into the order x, y.
         """
-        transform, said = scene.child("base_to_canonical"), scene.child("crs")
+        transform, stated = scene.child("base_to_canonical"), scene.child("crs")
         shift = np.array(transform.vector("shift", 3))
         scale = np.array(transform.vector("scale", 3))
         if not np.all(scale > 0.0):
@@ -125,45 +126,45 @@ class _Scene:
         swaps = transform["swap_xy"] is True
         if swaps:
             scale = scale[[1, 0, 2]]
-        crs = _parsed(said)
+        crs = _parsed(stated)
         if crs is None:
             return cls(None, shift, scale, 1.0, 0.0)
-        _check_axes(said, crs, swaps=swaps)
-        if len(crs.axis_info) > 2 and "geoid_height" not in said:
+        _check_axes(stated, crs, swaps=swaps)
+        if len(crs.axis_info) > 2 and "geoid_height" not in stated:
             return cls(crs.to_wkt(), shift, scale, 1.0, 0.0)
         factor = crs.axis_info[-1].unit_conversion_factor
-        if len(crs.axis_info) == 2:  # heights are as long as eastings once both are scaled
+        if len(crs.axis_info) == 2:  # scaled heights and scaled eastings have the same unit
             factor *= float(scale[2] / scale[0])
         horizontal = crs.sub_crs_list[0] if crs.is_compound else crs.to_2d()
-        return cls(horizontal.to_wkt(), shift, scale, factor, said.number("geoid_height", 0.0))
+        return cls(horizontal.to_wkt(), shift, scale, factor, stated.number("geoid_height", 0.0))
 
     def map_from_canonical(self, position: FloatArray) -> FloatArray:
-        """Bring positions (n, 3) into the map, x first."""
+        """Transform positions (n, 3) to the map, x first."""
         base = (position - self.shift) / self.scale
         base[:, 2] = (base[:, 2] + self.geoid_height) * self.height_factor
         return base
 
 
-def _parsed(said: NamedValues) -> CRS | None:
-    """Return the CRS; None where it is not on the Earth."""
-    text = said.text("definition")
+def _parsed(stated: NamedValues) -> CRS | None:
+    """Return the CRS; None if it is not on the Earth."""
+    text = stated.text("definition")
     try:
         crs = crs_of(text)
     except CRSError as error:
-        raise said.error(f"is not a CRS that pyproj reads ({text[:40]!r})") from error
+        raise stated.error(f"is not a CRS that pyproj reads ({text[:40]!r})") from error
     if crs.geodetic_crs is None:
         return None
     if not crs.is_projected:
-        raise said.error(f"{crs.name!r} is not projected")
+        raise stated.error(f"{crs.name!r} is not projected")
     return crs
 
 
-def _check_axes(said: NamedValues, crs: CRS, *, swaps: bool) -> None:
+def _check_axes(stated: NamedValues, crs: CRS, *, swaps: bool) -> None:
     """Refuse axes that swapping would not bring into the order x, y."""
     directions = [axis.direction for axis in crs.axis_info[:2]]
     swapped = {"north east": True, "east north": False, "west south": False}
     if swapped.get(" ".join(directions)) is not swaps:
-        raise said.error(
+        raise stated.error(
             f"has the axes {' and '.join(directions)} with swap_xy {str(swaps).lower()}",
             "export the project in a CRS of easting and northing",
         )

@@ -21,7 +21,7 @@ class OrientationFileOptions:
     """The keys of [reference] about its file."""
 
     form: str | None = None  # name of the format; None: the content tells
-    # of the file's coordinates, for pyproj, where the file does not give it; None: the flight's, or
+    # of the file's coordinates, for pyproj, if the file does not give it; None: the flight's, or
     # the format's default
     crs: str | None = None
     # holds what was subtracted from the file's coordinates; None: nothing was
@@ -38,16 +38,15 @@ class SourcePoses:
     # the file's frame: of a map its x, y and z at the projection centre
     frame_from_photo: FloatArray
     crs: str | None = None  # of the positions, x first; None: the file does not say it
-    # where the file's frame is east, north, up in metres over a point that it names
+    # if the file's frame is east, north, up in metres at a point that it names
     level: LocalFrame | None = None
-    # why the coordinates belong to no map unless flight.toml names one; None: they are in the
-    # flight's
+    # why the coordinates are in no map unless flight.toml names one; None: they are in the flight's
     unreferenced: str | None = None
     # (n, 3): standard deviations along the map's axes [m]; None: not given
     sd_position_m: FloatArray | None = None
     # (n,): of each of the three angles [deg]; None: not given
     sd_angle_deg: FloatArray | None = None
-    # whether the names are those of the flight's frames already, and no other program's
+    # whether the names are already those of the flight's frames, not of another program
     has_our_names: bool = False
 
 
@@ -67,7 +66,7 @@ def photo_rotations(
 
 
 def require_rotation(file: ForeignFile, where: str, matrix: FloatArray) -> None:
-    """Refuse a matrix (3, 3) that is not a rotation with a `KgcpError`."""
+    """Raise `KgcpError` if a matrix (3, 3) is not a rotation."""
     departure = np.abs(matrix @ matrix.T - np.eye(3)).max()
     if not departure < _MAX_DISTORTION or np.linalg.det(matrix) < 0.0:
         raise file.error_at(where, "has a matrix that is not a rotation")
@@ -76,7 +75,7 @@ def require_rotation(file: ForeignFile, where: str, matrix: FloatArray) -> None:
 def from_geocentric(
     names: tuple[str, ...], ecef_m: FloatArray, ecef_from_photo: FloatArray, geodetic: str
 ) -> SourcePoses:
-    """Bring Earth-centred poses into longitude, latitude and height and their local axes.
+    """Transform Earth-centred poses to longitude, latitude and height, and to their local axes.
 
     Parameters
     ----------
@@ -93,7 +92,7 @@ def from_geocentric(
 def from_level(
     names: tuple[str, ...], enu_m: FloatArray, enu_from_photo: FloatArray, local_frame: LocalFrame
 ) -> SourcePoses:
-    """Bring poses in the ENU axes of one point into a geographic CRS and their own local axes.
+    """Transform poses in the ENU axes of one point to a geographic CRS and their own local axes.
 
     Parameters
     ----------

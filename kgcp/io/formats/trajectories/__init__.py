@@ -1,8 +1,9 @@
 """Readers of the vehicle's trajectory, one module per format.
 
-A module offers `matches(file)`, whether a file's content is of its format, and `read(file, options,
-flight_crs)`, its epochs, and has one line in `FORMATS`. `read` raises `KgcpError`, which names line
-or record, for a file that is not as its format says or for which flight.toml lacks a key.
+Each module has one line in `FORMATS` and offers two functions. `matches(file)` says whether the
+content has its format, `read(file, options, flight_crs)` returns its epochs. `read` raises
+`KgcpError`, which names line or record, if a file does not follow its format or flight.toml lacks a
+key.
 """
 
 from __future__ import annotations
@@ -36,11 +37,11 @@ FORMATS: Registry[Callable[[ForeignFile, TrajectoryFileOptions, str], Epochs]] =
     "declare separator, decimal and columns under [vehicle], as 'kgcp init' does, or"
     f" {SEPARATOR_REMEDY}",
 )
-_CONTRACT = TrajectoryFileOptions()
+_DEFAULT_OPTIONS = TrajectoryFileOptions()
 
 
 def read_trajectory(
-    path: Path, flight_crs: str, options: TrajectoryFileOptions = _CONTRACT
+    path: Path, flight_crs: str, options: TrajectoryFileOptions = _DEFAULT_OPTIONS
 ) -> Trajectory:
     """Read the vehicle's trajectory, in one of the `FORMATS` of docs/foreign_files.md.
 
@@ -52,8 +53,9 @@ def read_trajectory(
     Raises
     ------
     KgcpError
-        Naming file and line: it is missing, of no known format or wrong, its times lack a day or
-        a time system, no exact way leads to the flight's CRS, or it has no attitude.
+        If the file is missing, of no known format or wrong, its times lack a day or a time system,
+        its CRS cannot be transformed exactly to the flight's, or it has no attitude. The message
+        names file and line.
     """
     file = ForeignFile(path, "[vehicle] trajectory")
     if not file.head.strip():
@@ -100,7 +102,7 @@ def _refuse_foreign_keys(form: str, options: TrajectoryFileOptions) -> None:
 
 
 def _on_map(path: Path, epochs: Epochs, crs: str) -> Epochs:
-    """Bring positions, and what is given along the axes, to the flight's CRS."""
+    """Transform positions and their covariances to the flight's CRS."""
     position = convert_positions(str(path), epochs.position, epochs.crs, crs)
     cov = epochs.cov_position_m2
     if cov is None and epochs.sd_position_m is not None:

@@ -25,8 +25,8 @@ def read(file: ForeignFile, options: TrajectoryFileOptions, flight_crs: str) -> 
     """Read a trajectory from a CSV file by docs/foreign_files.md.
 
     Columns time, x, y, z, roll_deg, pitch_deg, heading_deg and, optionally, sd_x … sd_heading_deg,
-    in any order, or what `options.layout` calls them. The attitude may be absent where it is not
-    wanted.
+    in any order, or with the names in `options.layout`. The attitude may be missing if the course
+    replaces it.
     """
     with_attitude = options.course_sd_deg is None
     columns = read_csv_columns(

@@ -1,4 +1,4 @@
-"""Where and when a trajectory begins, before flight.toml says anything about its file."""
+"""Place and time of a trajectory's beginning, without the keys of flight.toml."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ class FirstEpoch:
     x: float
     y: float
     crs: str | None  # of x, y, for pyproj; None: the file does not say
-    time: str  # as the file has it; empty where the format says all about its times
+    time: str  # as in the file; empty if the format defines day and time system
 
 
 def first_epoch(file: TrajectoryFile) -> FirstEpoch | None:
-    """Return the first epoch of a trajectory; None where the file cannot be read."""
+    """Return the first epoch of a trajectory; None if the file cannot be read."""
     try:
         if file.format == "sbet":
             return _of_sbet(file.path)

@@ -1,4 +1,4 @@
-"""CSV trajectories of other programs: which of their columns are those of docs/foreign_files.md."""
+"""CSV trajectories of other programs: their columns in the names of docs/foreign_files.md."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from kgcp.io.files.csv_sniff import SniffedTable, sniff_table
 from kgcp.io.files.gps_time import TimeSystem
 from kgcp.io.files.sniff import ForeignFile
 
-# What programs call a column, without blanks, marks and units. Longitude and latitude, easting and
-# northing stand apart: one pair must be whole.
+# Names of columns in other programs, without blanks, marks and units. Longitude and latitude are
+# separate from easting and northing: one pair must be complete.
 _TIMES = (
     *("time", "utc", "utctime", "timeutc", "gpstime", "timegps", "gpst", "timestamp", "datetime"),
     *("unixtime", "epoch", "t", "zeit", "zeitstempel", "uhrzeit", "sow", "tow", "secondsofweek"),
@@ -68,7 +68,7 @@ class ForeignTable:
 
     @property
     def time_system(self) -> TimeSystem | None:
-        """Whose clock its times are of, by the name of their column; None: it does not say."""
+        """Time system by the name of the time column; None: the name does not say."""
         name = self.table.name_of("time")
         if _GPS.search(name):
             return TimeSystem.GPS
@@ -76,9 +76,9 @@ class ForeignTable:
 
 
 def recognised_table(file: ForeignFile) -> ForeignTable | None:
-    """Return how a file writes a trajectory; None where it has not time and position.
+    """Return the table of a trajectory in a file; None if it lacks time or position.
 
-    Groups that are not whole (a heading without roll, deviations of two axes) are left out.
+    Incomplete groups (a heading without roll, deviations of two axes) are left out.
     """
     for positions, is_geographic in ((_ANGLES, True), (_GRID, False)):
         known = {"time": _TIMES, **positions, "z": _HEIGHT, **_ATTITUDE, **_DEVIATIONS}

@@ -31,13 +31,13 @@ class TrajectoryFileOptions:
     format: str | None = None  # its name; None: the content tells
     crs: str | None = None  # of the file's positions, for pyproj; None: the format's default
     time_system: TimeSystem | None = None  # of the file's times; None: the format's default
-    # when the trajectory begins, by its own clock; given, the file's numbers are seconds of the
-    # week
+    # day on which the trajectory begins, by its own clock; if given, the file's times are seconds
+    # of the week
     first_day: date | None = None
     accuracies_file: Path | None = None  # with SBET: smrmsg file of its standard deviations
     # with SBET: what to do with the wander angle; None: it has to be zero
     wander: Wander | None = None
-    # given, the attitude is that of the course over ground, level, with these standard deviations
+    # if given, the attitude is level along the course over ground, with these standard deviations
     # of roll, pitch and heading; None: the file has the attitude
     course_sd_deg: tuple[float, float, float] | None = None
     layout: CsvLayout = field(default_factory=CsvLayout)  # with CSV: how its table is written
@@ -61,7 +61,7 @@ class Epochs:
     attitude_deg: FloatArray | None
     # (n, 3): standard deviations along the axes of `crs` [m]
     sd_position_m: FloatArray | None = None
-    # (n, 3, 3): covariances along the axes of `crs` [m²], where the file has more than deviations
+    # (n, 3, 3): covariances along the axes of `crs` [m²], if the file has more than deviations
     cov_position_m2: FloatArray | None = None
     sd_attitude_deg: FloatArray | None = None  # (n, 3): of roll, pitch, heading [deg]
 
@@ -73,11 +73,11 @@ def check_times(path: Path, time_s: FloatArray, place: Callable[[int], str]) -> 
     """
     if len(time_s) < 2:
         raise KgcpError(f"{path}: has {len(time_s)} epochs; interpolation needs at least two")
-    wrong = np.flatnonzero(np.diff(time_s) <= 0.0)
-    if wrong.size:
-        row = int(wrong[0]) + 1
-        how = "repeats" if time_s[row] == time_s[row - 1] else "lies before"
+    not_later = np.flatnonzero(np.diff(time_s) <= 0.0)
+    if not_later.size:
+        row = int(not_later[0]) + 1
+        problem = "repeats" if time_s[row] == time_s[row - 1] else "lies before"
         raise KgcpError(
-            f"{path}, {place(row)}: the time {how} that of {place(row - 1)}, by"
+            f"{path}, {place(row)}: the time {problem} that of {place(row - 1)}, by"
             f" {time_s[row - 1] - time_s[row]:g} s; sort the epochs and keep one of each"
         )

@@ -1,7 +1,7 @@
 """Trajectories of RTKLIB: `.pos`.
 
-By RTKLIB's manual, appendix B: heights are above the ellipsoid or a geoid, as the header says;
-covariances stand as signed square roots, `sdne` for the one of north and east.
+By RTKLIB's manual, appendix B: heights are above the ellipsoid or a geoid, as the header says.
+Covariances are written as signed square roots, `sdne` for that of north and east.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ def read(file: ForeignFile, options: TrajectoryFileOptions, _flight_crs: str) ->
         )
     geocentric = "x-ecef" in solution.columns
     position, deviations, roots = _ECEF if geocentric else _GEODETIC
-    lacking = [name for name in position if name not in solution.columns]
-    if lacking:
-        raise file.error(f"its header lacks {', '.join(lacking)}", _AS_HEIGHTS)
+    missing = [name for name in position if name not in solution.columns]
+    if missing:
+        raise file.error(f"its header lacks {', '.join(missing)}", _AS_HEIGHTS)
     if options.crs is None and not geocentric:
         _check_heights(solution)
     cov = None
@@ -55,9 +55,9 @@ def read(file: ForeignFile, options: TrajectoryFileOptions, _flight_crs: str) ->
 def _check_heights(solution: RtklibSolution) -> None:
     if (solution.datum.upper(), solution.heights) == ("WGS84", "ellipsoidal"):
         return
-    found = f"{solution.datum}/{solution.heights}" if solution.datum else "unknown"
+    stated = f"{solution.datum}/{solution.heights}" if solution.datum else "unknown"
     raise KgcpError(
-        f"{solution.path}: its header gives datum and heights as {found}, not WGS84/ellipsoidal;"
+        f"{solution.path}: its header gives datum and heights as {stated}, not WGS84/ellipsoidal;"
         " write ellipsoidal heights (out-height = ellipsoidal), or name the file's CRS with its"
         " heights under [vehicle] crs in flight.toml"
     )
@@ -71,7 +71,7 @@ def _covariances(deviations: FloatArray, roots: FloatArray) -> FloatArray:
     """Return covariances (n, 3, 3) of deviations (n, 3) and signed roots of xy, yz, zx (n, 3).
 
     RTKLIB writes sign(c)·√|c| of a covariance c. Rounding to 0.1 mm can make a matrix that is not a
-    covariance: its negative eigenvalues become 0.
+    covariance. Its negative eigenvalues are then set to 0.
     """
     cov = np.zeros((len(deviations), 3, 3))
     cov[:, range(3), range(3)] = deviations**2

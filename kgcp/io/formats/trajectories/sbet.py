@@ -1,9 +1,10 @@
 """Applanix's smoothed best estimate of trajectory (SBET), and its accuracies (smrmsg).
 
 By POSPac MMS's export formats: both are records of little-endian doubles without any header, so
-that a file says neither its day nor its time system. Angles of SBET are radians. The heading is
-that of the platform in the wander frame, unless the export has corrected it: programs differ, hence
-[vehicle] wander. Standard deviations of smrmsg are metres (north before east) and arc minutes.
+that a file states neither its day nor its time system. Angles of SBET are radians. The heading is
+that of the platform in the wander frame, unless the export has corrected it. Programs differ in
+this, hence [vehicle] wander. Standard deviations of smrmsg are metres (north before east) and arc
+minutes.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ _RECORD = 17  # time, latitude, longitude, height, 3 velocities, roll, pitch, he
 _ACCURACY = 10  # time, sd of north, east, down, of 3 velocities, of roll, pitch, heading
 _DOUBLE = 8
 _ARC_MINUTES_PER_DEGREE = 60.0
-_MOST_BYTES = (1 << 30) - 1  # ten hours at 200 Hz
+_MAX_BYTES = (1 << 30) - 1  # ten hours at 200 Hz
 _MAX_WANDER_RAD = 1e-6
-_TINY = 1e-12  # zeros, and what other bytes are as doubles
+_TINY = 1e-12  # zeros, and other bytes read as doubles, are smaller
 
 
 def matches(file: ForeignFile) -> bool:
@@ -39,15 +40,15 @@ def matches(file: ForeignFile) -> bool:
     if not np.isfinite(values).all():
         return False
     seconds, latitude, longitude, height = values[:4]
-    sound = -86400.0 < seconds < 3e6 and abs(height) < 1e5
-    on_earth = _TINY < abs(latitude) <= np.pi / 2.0 and _TINY < abs(longitude) <= 2.0 * np.pi
-    return bool(sound and on_earth)
+    is_plausible = -86400.0 < seconds < 3e6 and abs(height) < 1e5
+    is_on_earth = _TINY < abs(latitude) <= np.pi / 2.0 and _TINY < abs(longitude) <= 2.0 * np.pi
+    return bool(is_plausible and is_on_earth)
 
 
 def read(file: ForeignFile, options: TrajectoryFileOptions, _flight_crs: str) -> Epochs:
     """Read records of 17 little-endian doubles: seconds of the week, radians, metres.
 
-    Deviations are those of the smrmsg file that flight.toml names, if it does.
+    Standard deviations are those of the smrmsg file, if flight.toml names one.
     """
     path = file.path
     records = _read_records(path, _RECORD, file.toml_key)
@@ -75,7 +76,7 @@ def first_record(path: Path) -> FloatArray:
 
 
 def _read_records(path: Path, columns: int, toml_key: str) -> FloatArray:
-    data = read_bytes(path, toml_key, _MOST_BYTES)
+    data = read_bytes(path, toml_key, _MAX_BYTES)
     size = columns * _DOUBLE
     if not data or len(data) % size:
         raise KgcpError(
@@ -86,13 +87,13 @@ def _read_records(path: Path, columns: int, toml_key: str) -> FloatArray:
 
 
 def _check_values(path: Path, records: FloatArray) -> None:
-    finite = (np.abs(records[:, [0, 1, 2, 3, 7, 8, 9, 10]]) < LARGEST).all(axis=1)
-    on_earth = (np.abs(records[:, 1]) <= np.pi / 2.0) & (np.abs(records[:, 2]) <= 2.0 * np.pi)
-    wrong = np.flatnonzero(~(finite & on_earth))
-    if wrong.size:
-        time, latitude, longitude, height = records[wrong[0], :4]
+    is_finite = (np.abs(records[:, [0, 1, 2, 3, 7, 8, 9, 10]]) < LARGEST).all(axis=1)
+    is_on_earth = (np.abs(records[:, 1]) <= np.pi / 2.0) & (np.abs(records[:, 2]) <= 2.0 * np.pi)
+    invalid = np.flatnonzero(~(is_finite & is_on_earth))
+    if invalid.size:
+        time, latitude, longitude, height = records[invalid[0], :4]
         raise KgcpError(
-            f"{path}, record {wrong[0] + 1}: time {time:g}, latitude {latitude:g} rad, longitude"
+            f"{path}, record {invalid[0] + 1}: time {time:g}, latitude {latitude:g} rad, longitude"
             f" {longitude:g} rad, height {height:g} m is impossible; the file is damaged or of"
             " another format: export it again"
         )
@@ -114,20 +115,20 @@ def _attitude_deg(path: Path, records: FloatArray, wander: Wander | None) -> Flo
 def _read_accuracies(path: Path, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return deviations of east, north, up [m] and roll, pitch, heading [deg] at these seconds."""
     records = _read_records(path, _ACCURACY, "[vehicle] accuracies")
-    own, wanted = unwrap_week(records[:, 0]), unwrap_week(seconds)
-    steps = np.diff(own)
-    if len(own) < 2 or steps.min() <= 0.0:
+    accuracy_s, epoch_s = unwrap_week(records[:, 0]), unwrap_week(seconds)
+    steps = np.diff(accuracy_s)
+    if len(accuracy_s) < 2 or steps.min() <= 0.0:
         raise KgcpError(f"{path}: its times do not ascend; export it again")
     margin = steps.max()
-    if wanted[0] < own[0] - margin or wanted[-1] > own[-1] + margin:
+    if epoch_s[0] < accuracy_s[0] - margin or epoch_s[-1] > accuracy_s[-1] + margin:
         raise KgcpError(
-            f"{path}: covers the seconds {own[0]:g} to {own[-1]:g}, the trajectory {wanted[0]:g} to"
-            f" {wanted[-1]:g}; give the accuracies of this trajectory"
+            f"{path}: covers the seconds {accuracy_s[0]:g} to {accuracy_s[-1]:g}, the trajectory"
+            f" {epoch_s[0]:g} to {epoch_s[-1]:g}; give the accuracies of this trajectory"
         )
     deviations = records[:, [2, 1, 3, 7, 8, 9]]
     if not np.isfinite(deviations).all() or deviations.min() < 0.0:
         raise KgcpError(
             f"{path}: holds standard deviations that are negative or not finite; export it again"
         )
-    at_epochs = np.column_stack([np.interp(wanted, own, column) for column in deviations.T])
+    at_epochs = np.column_stack([np.interp(epoch_s, accuracy_s, column) for column in deviations.T])
     return at_epochs[:, :3], at_epochs[:, 3:] / _ARC_MINUTES_PER_DEGREE

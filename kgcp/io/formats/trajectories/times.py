@@ -22,7 +22,8 @@ def times_from_texts(
     Raises
     ------
     KgcpError
-        Naming the line: no time, no zone, or a zone that contradicts `time_system`.
+        If a text is no time, has no zone, or has a zone that contradicts `time_system`. The message
+        names the line.
     """
     if options.first_day is not None:
         return times_from_week(path, _numbers(path, lines, texts), options)
@@ -45,9 +46,9 @@ def times_from_week(path: Path, seconds: FloatArray, options: TrajectoryFileOpti
     """
     day, system = options.first_day, options.time_system
     if day is None or system is None:
-        lacking = [key for key, value in (("date", day), ("time_system", system)) if value is None]
+        missing = [key for key, value in (("date", day), ("time_system", system)) if value is None]
         raise KgcpError(
-            f"{path}: its times are seconds of a week; give {' and '.join(lacking)} under"
+            f"{path}: its times are seconds of a week; give {' and '.join(missing)} under"
             " [vehicle] in flight.toml: date = 2026-05-04, the day of the first epoch, and"
             ' time_system = "gps" or "utc"'
         )

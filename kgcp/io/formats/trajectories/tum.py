@@ -34,16 +34,16 @@ def read(file: ForeignFile, options: TrajectoryFileOptions, flight_crs: str) -> 
     crs = options.crs or flight_crs
     position = numbers[:, :3]
     norms = np.linalg.norm(numbers[:, 3:], axis=1)
-    wrong = np.flatnonzero(np.abs(norms - 1.0) > _MAX_NORM_ERROR)
-    if wrong.size:
+    not_unit = np.flatnonzero(np.abs(norms - 1.0) > _MAX_NORM_ERROR)
+    if not_unit.size:
         raise KgcpError(
-            f"{path}, line {lines[wrong[0]]}: its quaternion has the norm {norms[wrong[0]]:g};"
-            " write timestamp tx ty tz qx qy qz qw with a unit quaternion"
+            f"{path}, line {lines[not_unit[0]]}: its quaternion has the norm"
+            f" {norms[not_unit[0]]:g}; write timestamp tx ty tz qx qy qz qw with a unit quaternion"
         )
     attitude_deg = None
     if options.course_sd_deg is None:
         attitude_deg = _attitude_deg(crs, position, numbers[:, 3:])
-        _refuse_roof(path, attitude_deg)
+        _refuse_upside_down(path, attitude_deg)
     return Epochs(time_s, crs, position, attitude_deg)
 
 
@@ -79,7 +79,7 @@ def _attitude_deg(crs: str, position: FloatArray, quaternions: FloatArray) -> Fl
     return np.column_stack((roll, pitch, heading % 360.0))
 
 
-def _refuse_roof(path: Path, attitude_deg: FloatArray) -> None:
+def _refuse_upside_down(path: Path, attitude_deg: FloatArray) -> None:
     if np.median(np.abs(attitude_deg[:, 0])) > 90.0:
         raise KgcpError(
             f"{path}: by its quaternions the vehicle drives on its roof; body axes are x forward,"

@@ -133,7 +133,7 @@ def test_images_of_a_rig_have_poses_of_their_own(tmp_path: Path) -> None:
         (
             "1 1 0 0 0 1 2 3 1 a.JPG\n\n",
             OrientationFileOptions(crs="EPSG:4326"),
-            r"\[reference\] crs 'EPSG:4326' counts degrees, but the poses are in a Cartesian",
+            r"\[reference\] crs 'EPSG:4326' is in degrees, but the poses are in a Cartesian",
         ),
         (
             "1 1 0 0 0 1 2 3 1 a.JPG\n\n",

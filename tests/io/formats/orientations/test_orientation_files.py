@@ -141,7 +141,7 @@ def test_a_missing_grid_is_named(tmp_path: Path) -> None:
     path.write_text(json.dumps([{"shots": {"a": shot}, "reference_lla": reference}]))
     with pytest.raises(KgcpError, match=r"needs the grid \S+, which is not installed; install"):
         read_reference_poses(path, crs="EPSG:25831+5773")
-    with pytest.raises(KgcpError, match=r"has coordinates of its own CRS, but flight.toml has no"):
+    with pytest.raises(KgcpError, match=r"has coordinates in its own CRS, but flight.toml"):
         read_reference_poses(path)
 
 
