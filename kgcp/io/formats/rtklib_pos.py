@@ -111,7 +111,7 @@ def _clocks_and_cells(
             if len(texts) < width:
                 raise file.error_at(
                     f"line {line}",
-                    f"has {len(texts)} cells after the time, the header names {width}",
+                    f"has {len(texts)} cells after the time, but the header names {width}",
                     "repair the line",
                 )
             cells[index] = [float(text) for text in texts[:width]]

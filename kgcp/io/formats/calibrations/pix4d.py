@@ -73,7 +73,7 @@ def _mm_entry(file: ForeignFile, name: str, block: str) -> Entry:
     where = f"camera {name!r}"
     sensor = _SENSOR.search(block)
     if sensor is None:
-        raise file.error_at(where, "does not say its sensor width", "export it from Pix4D again")
+        raise file.error_at(where, "does not state its sensor width", "export it from Pix4D again")
     width_mm, height_mm = file.numbers(f"{sensor[1]} {sensor[2]}", 2, where)
     if min(width_mm, height_mm) <= 0.0:
         raise file.error_at(where, "has a sensor of zero size", "export it from Pix4D again")

@@ -26,7 +26,7 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
     try:
         info = load_yaml(file.text)
         if not isinstance(info, dict):
-            raise TypeError("no mapping")
+            raise TypeError("not a mapping")
         model, name = info.get("distortion_model", "plumb_bob"), info.get("camera_name", "")
         size = (int(info["image_width"]), int(info["image_height"]))
         matrix = np.reshape([float(value) for value in info["camera_matrix"]["data"]], (3, 3))
