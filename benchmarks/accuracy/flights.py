@@ -33,6 +33,12 @@ HEADER = (
 _SIGMAS = 3.0
 
 
+def truth_path(flight: Path) -> Path:
+    """Return the truth.csv of a flight, which lies in its folder or beside it."""
+    within = flight / "truth.csv"
+    return within if within.exists() else flight.parent / "truth.csv"
+
+
 def sides_told_apart(flight: Flight, right: pd.DataFrame) -> pd.Series:
     """Return whether the two normals of measured targets differ by more than what is known allows.
 
@@ -75,12 +81,11 @@ def main(flights: tuple[Path, ...], jobs: int | None) -> None:
     """Print the table."""
     print(HEADER)
     for folder in flights:
-        beside = folder.parent / "truth.csv"
-        truth = folder / "truth.csv" if (folder / "truth.csv").exists() else beside
+        truth = truth_path(folder)
         table = join_truth(
             detect(folder, DetectSettings(), jobs or usable_cores()), read_truth(truth)
         )
-        name = folder.name if truth != beside else folder.parent.name
+        name = truth.parent.name  # a folder called flight may have the truth beside it
         print(line_of(name, read_flight(folder), table), flush=True)
 
 

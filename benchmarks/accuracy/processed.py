@@ -22,14 +22,15 @@ import numpy.typing as npt
 
 from benchmarks.accuracy.bands import join_truth, read_truth
 from benchmarks.accuracy.evaluate import detect
-from benchmarks.accuracy.flights import HEADER, line_of
+from benchmarks.accuracy.flights import HEADER, line_of, truth_path
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.images.frames import list_frames
 from kgcp.pipeline.execution.resilient_map import usable_cores
 from kgcp.settings import DetectSettings
 
 Pixels = npt.NDArray[np.uint8]  # (rows, columns) or (rows, columns, 3)
-_QUALITY = 95  # of JPEGs that are written again
+_COMPRESSIONS = {"JPEG 70": 70, "JPEG 40": 40}  # their quality
+_QUALITY = 95  # of other JPEGs
 _SPOILT_SHARE, _SEED = 0.001, 3  # of the pixels
 
 
@@ -103,11 +104,10 @@ PROCESSINGS: Mapping[str, Callable[[Pixels], Pixels]] = {
     "sharpened": lambda pixels: _less_blurred(pixels, 2.0, 1.5),
     "local contrast": lambda pixels: _less_blurred(pixels, 15.0, 0.5),
     "CLAHE": _contrast_by_tiles,
-    "JPEG 70": lambda pixels: pixels,
-    "JPEG 40": lambda pixels: pixels,
+    **dict.fromkeys(_COMPRESSIONS, lambda pixels: pixels),
     "interlaced": _interlaced,
 }
-"""What becomes of the pixels of a frame, by name; that of JPEGs when they are written."""
+"""What becomes of the pixels of a frame, by name; they are compressed when it is written."""
 
 
 def process_flight(flight: Path, name: str, out: Path) -> None:
@@ -118,12 +118,12 @@ def process_flight(flight: Path, name: str, out: Path) -> None:
     settings.write_text(
         re.sub(r"(?m)^response = .*$", 'response = "unknown"', settings.read_text("utf-8")), "utf-8"
     )
-    quality = int(name.removeprefix("JPEG ")) if name.startswith("JPEG ") else _QUALITY
+    quality = _COMPRESSIONS.get(name, _QUALITY)
     for frame in list_frames(frames):
         pixels = cv2.imread(str(frames / frame), cv2.IMREAD_UNCHANGED)
         if pixels is None or pixels.dtype != np.uint8:
             raise click.UsageError(f"{frames / frame}: is no frame of 8 bits")
-        is_jpeg = name.startswith("JPEG ") or Path(frame).suffix.lower() in {".jpg", ".jpeg"}
+        is_jpeg = name in _COMPRESSIONS or Path(frame).suffix.lower() in {".jpg", ".jpeg"}
         _, encoded = cv2.imencode(
             ".jpg" if is_jpeg else ".png",
             PROCESSINGS[name](pixels.astype(np.uint8)),
@@ -139,8 +139,7 @@ def process_flight(flight: Path, name: str, out: Path) -> None:
 def main(flights: tuple[Path, ...], only: tuple[str, ...], jobs: int | None) -> None:
     """Print a table for each flight."""
     for flight in flights:
-        beside = flight.parent / "truth.csv"
-        truth = read_truth(flight / "truth.csv" if (flight / "truth.csv").exists() else beside)
+        truth = read_truth(truth_path(flight))
         print(f"{flight}\n{HEADER}", flush=True)
         for name in only or PROCESSINGS:
             with tempfile.TemporaryDirectory(prefix="kgcp_processed_") as folder:

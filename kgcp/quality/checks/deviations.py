@@ -12,44 +12,46 @@ from kgcp.georef.trajectory import Motion
 from kgcp.quality.checks.doubt import Cause, Doubt, mild
 from kgcp.settings import VehicleSettings
 
+_MIN_SD_M, _MAX_SD_M = 0.0005, 10.0  # usual range of a receiver's positions
+_MAX_LEVER_ARM_SD_M, _MAX_TIME_SD_S = 0.5, 0.5
 _REMEDY = (
     "give those of the receiver's software, or remove their columns from the trajectory's file"
 )
-_MIN_SD_M, _MAX_SD_M = 0.0005, 10.0  # usual range of a receiver's positions
-_MAX_LEVER_ARM_SD_M, _MAX_TIME_SD_S = 0.5, 0.5
 _POSES_REMEDY = "give those of the adjustment, or remove their columns from the poses' file"
 
 
 def check_deviations(motion: Motion) -> Iterator[Doubt]:
     """Yield doubts about standard deviations of a trajectory.
 
-    These are epochs whose positions count as exact, attitudes that all do, and deviations that
-    seem to be in millimetres or to be variances.
+    These are epochs whose position or attitude counts as exact, and deviations that seem to be in
+    millimetres or to be variances.
     """
-    if motion.sd_position_m is not None:
-        zero = np.any(motion.sd_position_m == 0.0, axis=1)
-        if zero.any():
-            yield mild(
-                Cause.STANDARD_DEVIATIONS,
-                "standard deviations of the trajectory's positions are 0"
-                f" at {_how_many(zero, 'epochs')}: points there are weighted far too much",
-                _REMEDY,
-                {"epochs": float(zero.sum())},
-            )
-        usual_m = np.median(motion.sd_position_m, axis=0)
+    sd_m = motion.sd_position_m
+    if sd_m is not None:
+        effect = "points there are weighted far too much"
+        is_zero = np.any(sd_m == 0.0, axis=1)
+        yield from _zeros(is_zero, "trajectory's positions", "epochs", effect, _REMEDY)
+        usual_m = np.median(sd_m, axis=0)
         if 0.0 < usual_m.min() < _MIN_SD_M:
-            yield _in_another_unit(
-                float(usual_m.min()), "which suggests variances, or values in degrees"
-            )
+            yield _in_another_unit(usual_m.min(), "which suggests variances, or values in degrees")
         elif usual_m.max() > _MAX_SD_M:
-            yield _in_another_unit(float(usual_m.max()), "which suggests millimetres")
-    if motion.sd_attitude_deg is not None and not motion.sd_attitude_deg.any():
-        yield mild(
-            Cause.STANDARD_DEVIATIONS,
-            "standard deviations of the trajectory's attitudes are 0 at all epochs: the lever arm's"
-            " direction counts as exact",
-            _REMEDY,
-        )
+            yield _in_another_unit(usual_m.max(), "which suggests millimetres")
+    if motion.sd_attitude_deg is not None:
+        effect = "the lever arm's direction counts as exact"
+        # of all three angles: level ground may be known better than can be written
+        is_zero = np.all(motion.sd_attitude_deg == 0.0, axis=1)
+        yield from _zeros(is_zero, "trajectory's attitudes", "epochs", effect, _REMEDY)
+
+
+def check_pose_deviations(poses: ReferencePoses) -> Iterator[Doubt]:
+    """Yield doubts about reference poses that count as exact."""
+    if poses.sd_position_m is not None:
+        effect = "reference distances count as far too accurate"
+        is_zero = np.any(poses.sd_position_m == 0.0, axis=1)
+        yield from _zeros(is_zero, "reference poses' positions", "poses", effect, _POSES_REMEDY)
+    if poses.sd_angle_deg is not None:
+        effect, is_zero = "directions count as exact", poses.sd_angle_deg == 0.0
+        yield from _zeros(is_zero, "reference poses' angles", "poses", effect, _POSES_REMEDY)
 
 
 def check_vehicle_deviations(settings: VehicleSettings) -> Iterator[Doubt]:
@@ -67,40 +69,19 @@ def check_vehicle_deviations(settings: VehicleSettings) -> Iterator[Doubt]:
             )
 
 
+def _zeros(is_zero: BoolArray, values: str, rows: str, effect: str, remedy: str) -> Iterator[Doubt]:
+    """Yield the doubt about deviations that are 0 in some of n rows, unless there are none."""
+    count = int(is_zero.sum())
+    if count:
+        which = f"{count} of {len(is_zero)} {rows}" if count < len(is_zero) else f"all {rows}"
+        sentence = f"standard deviations of the {values} are 0 for {which}: {effect}"
+        yield mild(Cause.STANDARD_DEVIATIONS, sentence, remedy, {rows: float(count)})
+
+
 def _in_another_unit(sd_m: float, words: str) -> Doubt:
     return mild(
         Cause.STANDARD_DEVIATIONS,
         f"standard deviations of the trajectory's positions are {sd_m:.2g} m (median), {words}",
         "give standard deviations in metres",
-        {"sd_m": sd_m},
+        {"sd_m": float(sd_m)},
     )
-
-
-def check_pose_deviations(poses: ReferencePoses) -> Iterator[Doubt]:
-    """Yield doubts about reference poses that count as exact."""
-    if poses.sd_position_m is not None:
-        zero = np.any(poses.sd_position_m == 0.0, axis=1)
-        if zero.any():
-            yield mild(
-                Cause.STANDARD_DEVIATIONS,
-                "standard deviations of the reference poses' positions are 0"
-                f" in {_how_many(zero, 'poses')}: reference distances count as far too accurate",
-                _POSES_REMEDY,
-                {"poses": float(zero.sum())},
-            )
-    if poses.sd_angle_deg is not None:
-        zero = poses.sd_angle_deg == 0.0
-        if zero.any():
-            yield mild(
-                Cause.STANDARD_DEVIATIONS,
-                "standard deviations of the reference poses' angles are 0"
-                f" in {_how_many(zero, 'poses')}: directions count as exact",
-                _POSES_REMEDY,
-                {"poses": float(zero.sum())},
-            )
-
-
-def _how_many(chosen: BoolArray, what: str) -> str:
-    """Return how many of n are chosen, in words."""
-    count = int(chosen.sum())
-    return f"{count} of {len(chosen)} {what}" if count < len(chosen) else f"all {what}"

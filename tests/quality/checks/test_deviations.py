@@ -33,18 +33,20 @@ def test_deviations_of_zero_are_doubted() -> None:
         replace(_MOTION, sd_position_m=0.0 * _SD, sd_attitude_deg=0.0 * _SD)
     )
     assert (position.code, position.is_grave) == (Cause.STANDARD_DEVIATIONS, False)
-    assert "positions are 0 at all epochs" in position.sentence
-    assert "attitudes are 0 at all epochs" in attitude.sentence
+    assert "positions are 0 for all epochs" in position.sentence
+    assert "attitudes are 0 for all epochs" in attitude.sentence
     (heights,) = check_deviations(replace(_MOTION, sd_position_m=_SD * [1.0, 1.0, 0.0]))
-    assert "positions are 0 at all epochs" in heights.sentence
+    assert "positions are 0 for all epochs" in heights.sentence
 
 
 def test_epochs_with_deviations_of_zero_are_counted() -> None:
     sd = _SD.copy()
     sd[2:4] = 0.0
     (doubt,) = check_deviations(replace(_MOTION, sd_position_m=sd))
-    assert "are 0 at 2 of 5 epochs" in doubt.sentence
+    assert "are 0 for 2 of 5 epochs" in doubt.sentence
     assert doubt.figures == {"epochs": 2.0}
+    (of_attitude,) = check_deviations(replace(_MOTION, sd_attitude_deg=sd))
+    assert "attitudes are 0 for 2 of 5 epochs" in of_attitude.sentence
 
 
 def test_reference_poses_with_deviations_of_zero_are_doubted() -> None:
@@ -55,8 +57,8 @@ def test_reference_poses_with_deviations_of_zero_are_doubted() -> None:
         replace(_POSES, sd_position_m=_SD * [1.0, 1.0, 0.0], sd_angle_deg=angles)
     )
     assert {position.code, angle.code} == {Cause.STANDARD_DEVIATIONS}
-    assert "reference poses' positions are 0 in all poses" in position.sentence
-    assert "reference poses' angles are 0 in 2 of 5 poses" in angle.sentence
+    assert "reference poses' positions are 0 for all poses" in position.sentence
+    assert "reference poses' angles are 0 for 2 of 5 poses" in angle.sentence
 
 
 @pytest.mark.parametrize(
