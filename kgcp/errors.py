@@ -227,8 +227,8 @@ class Reason(StrEnum):
     DECODE_FAILED = (
         "decode_failed",
         Status.UNREADABLE,
-        "the file is not an image, is damaged, or its pixels have neither 8 nor 16 bits",
-        "copy the files again; pixels must have 8 or 16 bits",
+        "the file is not an image, is damaged, or its pixels are of a kind that kgcp does not read",
+        "copy the files again; save pixels as grey or RGB with 8 or 16 bits",
     )
     WRONG_SIZE = (
         "wrong_size",

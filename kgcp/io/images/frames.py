@@ -21,7 +21,15 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.io.files.safe_read import is_file, is_folder
 from kgcp.io.images.exif import read_exif
-from kgcp.io.images.header import JPEG_END, JPEG_START, image_size, is_cut_jpeg, is_cut_png, upright
+from kgcp.io.images.header import (
+    JPEG_END,
+    JPEG_START,
+    image_size,
+    is_cut_jpeg,
+    is_cut_png,
+    misread_pixels,
+    with_stored_pixels,
+)
 
 __all__ = ["list_frames", "read_exif", "read_grey"]
 
@@ -53,8 +61,12 @@ _MAX_METADATA_BYTES = 1 << 26
 
 CORRECT_FOLDER = "correct [frames] folder in flight.toml"
 
-# libjpeg's messages on stderr about data that it had to guess; it does not stop decoding.
-_GUESSED_PIXELS = ("Corrupt JPEG data", "Premature end of JPEG file")
+# Messages on stderr about data that decoders had to guess; they do not stop decoding. Those of
+# libjpeg may come through libtiff, whose own errors OpenCV prints after "TIFF_Error".
+_CUT_JPEG = "Premature end of JPEG file"
+_GUESSED_PIXELS = re.compile(
+    rf"Corrupt JPEG data.*|{_CUT_JPEG}.*|PackBitsDecode.*|(?<=TIFF_Error ).*"
+)
 # OpenCV for Windows is linked with a C library of its own, whose stderr may not follow Python's.
 # There, cut files are recognised by their missing end.
 _COLLECTS_DECODER_MESSAGES = os.name != "nt"
@@ -216,7 +228,11 @@ def _encoded(path: Path, camera: Camera) -> bytes:
             max_size = _MAX_BYTES_PER_PIXEL * camera.width * camera.height + _MAX_METADATA_BYTES
             if size > max_size:
                 raise Rejection(Reason.DECODE_FAILED, f"{size} bytes are too many for its pixels")
-            data = upright(stream)
+            if pixels := misread_pixels(stream):
+                raise Rejection(
+                    Reason.DECODE_FAILED, f"a TIFF of {pixels}; save it as grey or RGB, or as PNG"
+                )
+            data = with_stored_pixels(stream)
     except OSError as error:  # no path: tables must not depend on the folder
         raise Rejection(Reason.DECODE_FAILED, error.strerror or str(error)) from error
     except ValueError as error:  # names that no file can have
@@ -238,7 +254,7 @@ def _decode(encoded: bytes) -> GreyArray:
     size = len(encoded)
     if encoded.startswith(JPEG_START):
         if not _COLLECTS_DECODER_MESSAGES and is_cut_jpeg(encoded):
-            raise Rejection(Reason.DECODE_FAILED, _GUESSED_PIXELS[1])
+            raise Rejection(Reason.DECODE_FAILED, _CUT_JPEG)
         # Truncated files get an end: then every version of the decoder notices the gap.
         encoded += JPEG_END
     grey = None
@@ -247,8 +263,8 @@ def _decode(encoded: bytes) -> GreyArray:
     if grey is None:
         raise Rejection(Reason.DECODE_FAILED, f"{size} bytes that are not a complete image")
     for message in messages:
-        if message.startswith(_GUESSED_PIXELS):
-            raise Rejection(Reason.DECODE_FAILED, message)
+        if guess := _GUESSED_PIXELS.search(message):
+            raise Rejection(Reason.DECODE_FAILED, guess[0])
     return grey
 
 
@@ -265,9 +281,12 @@ def _collected_stderr() -> Iterator[list[str]]:
         sys.stderr.flush()
         stderr = os.dup(2)
         os.dup2(sink.fileno(), 2)
+        log_level = cv2.utils.logging.getLogLevel()  # may be set to silent by the environment
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_WARNING)
         try:
             yield messages
         finally:
+            cv2.utils.logging.setLogLevel(log_level)
             os.dup2(stderr, 2)
             os.close(stderr)
             sink.seek(0)

@@ -1,9 +1,10 @@
-"""Size and orientation from the header of an image, before its pixels are decoded or even read.
+"""What the header of an image says, before its pixels are decoded or even read.
 
 Pillow gives sizes except those of TIFFs: it refuses pixels that frames may have (16-bit RGB), and
 reads every tag on opening. So this module reads the directory of a TIFF itself, by TIFF 6.0,
 section 2, and by BigTIFF, which counts with 8 bytes where TIFF has 2 or 4. The directory also has
-the orientation, and shows whether tags claim more bytes than the file has.
+the orientation and the layout of the pixels, and shows whether tags claim more bytes than the file
+has.
 """
 
 from __future__ import annotations
@@ -25,7 +26,13 @@ JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 _JPEG_MARKER = re.compile(rb"\xff[^\x00\x01\xd0-\xd7\xff]")
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _WIDTH, _HEIGHT, _ORIENTATION, _EXIF = 256, 257, 274, 34665
-_UPRIGHT = 1
+_BITS, _PHOTOMETRIC, _SAMPLES, _PLANES, _EXTRA_SAMPLES = 258, 262, 277, 284, 338
+_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB = 0, 1, 2
+_CONTIGUOUS, _SEPARATE = 1, 2
+_BYTE_BITS = 8
+# Values of tags by which OpenCV would change pixels. 0: nothing is said about the extra sample;
+# OpenCV multiplies colours by one that is said to be their opacity.
+_NEUTRAL = {_ORIENTATION: 1, _EXTRA_SAMPLES: 0}
 _SHORT = 3
 _MAX_TAGS = 0xFFFF  # as in libtiff
 _TYPE_BYTES = {
@@ -104,25 +111,51 @@ def image_size(stream: BinaryIO) -> tuple[int, int] | None:
         Image.MAX_IMAGE_PIXELS = limit
 
 
-def upright(stream: BinaryIO) -> bytes:
-    """Return the content of a file; the orientation tags of a TIFF are set to upright.
+def with_stored_pixels(stream: BinaryIO) -> bytes:
+    """Return the content of a file; in a TIFF, tags that change pixels are made neutral.
 
-    OpenCV turns a TIFF by that tag even if it is told not to.
+    OpenCV turns a TIFF by its orientation even if it is told not to, and darkens it by its opacity.
     """
     stream.seek(0)
     layout = _Layout.of(stream.read(16))
-    places = []
+    entries: list[_Entry] = []
     if layout is not None:
-        places = [entry.place for entry in _entries(stream, layout) if entry.tag == _ORIENTATION]
+        entries = [entry for entry in _entries(stream, layout) if entry.tag in _NEUTRAL]
     stream.seek(0)
     data = stream.read()
-    if layout is None or not places:
+    if layout is None or not entries:
         return data
     content = bytearray(data)
-    for place in places:
-        code = f"{layout.order}{layout.entry}H{layout.field - 2}x"
-        struct.pack_into(code, content, place, _ORIENTATION, _SHORT, 1, _UPRIGHT)
+    code = f"{layout.order}{layout.entry}H{layout.field - 2}x"
+    for entry in entries:
+        if entry.tag == _ORIENTATION or entry.count == 1:
+            struct.pack_into(code, content, entry.place, entry.tag, _SHORT, 1, _NEUTRAL[entry.tag])
     return bytes(content)
+
+
+def misread_pixels(stream: BinaryIO) -> str:
+    """Return which pixels of a TIFF OpenCV would read wrong without an error; "" if it would not.
+
+    Of more than 8 bits it reads only grey values with black as 0, and red, green and blue side by
+    side, with or without opacity.
+    """
+    stream.seek(0)
+    layout = _Layout.of(stream.read(16))
+    if layout is None:
+        return ""
+    entries = {entry.tag: entry for entry in reversed([*_entries(stream, layout)])}
+    values = {tag: entry.integer(layout.order) for tag, entry in entries.items()}
+    bits = _bits(stream, layout, entries[_BITS]) if _BITS in entries else 1
+    samples, photometric = values.get(_SAMPLES, 1), values.get(_PHOTOMETRIC)
+    if bits <= _BYTE_BITS or photometric is None:
+        return ""
+    if samples != 1 and values.get(_PLANES, _CONTIGUOUS) == _SEPARATE:
+        return f"separate planes of {bits} bits"
+    if photometric == _WHITE_IS_ZERO:
+        return f"grey values of {bits} bits with white as 0"
+    if (photometric, samples) in {(_BLACK_IS_ZERO, 1), (_RGB, 3), (_RGB, 4)}:
+        return ""
+    return f"channels of {bits} bits that are neither grey nor RGB"
 
 
 def is_greedy(stream: BinaryIO) -> bool:
@@ -167,6 +200,19 @@ def is_cut_jpeg(data: bytes) -> bool:
         # skip the segment: a thumbnail in it has an end of its own
         place = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2])
     return True
+
+
+def _bits(stream: BinaryIO, layout: _Layout, entry: _Entry) -> int:
+    """Return the bits of the first channel; 0 if the file does not hold them."""
+    values = entry.value
+    try:
+        if 2 * entry.count > layout.field:  # they are elsewhere in the file
+            (place,) = struct.unpack(layout.order + layout.first[-1], values)
+            stream.seek(place)
+            values = stream.read(2)
+        return int(struct.unpack_from(f"{layout.order}H", values)[0])
+    except (struct.error, OverflowError, ValueError, OSError):
+        return 0
 
 
 def _tiff_size(stream: BinaryIO, layout: _Layout) -> tuple[int, int] | None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import struct
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -34,6 +35,27 @@ def encoded(image: GreyArray, suffix: str, *options: int) -> bytes:
     done, data = cv2.imencode(suffix, image, list(options))
     assert done
     return data.tobytes()
+
+
+def tiff(pixels: bytes, bits: int, photometric: int, samples: int, **tags: int) -> bytes:
+    """Return an uncompressed TIFF of one strip; planes=2 stores channels one after the other."""
+    depth = struct.pack(f"<{samples}H", *[bits] * samples)
+    entries = {256: (4, 1, WIDTH), 257: (4, 1, HEIGHT), 262: (3, 1, photometric)}
+    entries |= {277: (3, 1, samples), 278: (4, 1, HEIGHT)}
+    entries |= {284: (3, 1, tags.get("planes", 1))}
+    if "opacity" in tags:
+        entries[338] = (3, 1, tags["opacity"])
+    strips = samples if tags.get("planes") == 2 else 1
+    place = 8 + 2 + 12 * (len(entries) + 3) + 4
+    sizes = struct.pack(f"<{strips}I", *[len(pixels) // strips] * strips)
+    first = place + len(depth) + 2 * len(sizes)
+    places = struct.pack(f"<{strips}I", *range(first, first + len(pixels), len(pixels) // strips))
+    entries[258] = (3, samples, place if samples > 2 else bits * 65537)
+    entries[273] = (4, strips, place + len(depth) if strips > 1 else first)
+    entries[279] = (4, strips, place + len(depth) + len(sizes) if strips > 1 else len(pixels))
+    directory = b"".join(struct.pack("<HHII", tag, *entries[tag]) for tag in sorted(entries))
+    head = b"II*\0" + struct.pack("<IH", 8, len(entries)) + directory + bytes(4)
+    return head + depth + places + sizes + pixels
 
 
 def rejection(path: Path) -> Rejection:
@@ -214,6 +236,55 @@ except Rejection as rejection:
         path = tmp_path / "float.tif"
         path.write_bytes(encoded(textured().astype(np.float32), ".tif"))
         assert "float32" in rejection(path).detail
+
+    @pytest.mark.parametrize(
+        ("photometric", "channels", "planes", "said"),
+        [
+            (0, 1, 1, "16 bits with white as 0"),
+            (2, 3, 2, "separate planes of 16 bits"),
+            (1, 2, 1, "16 bits that are neither grey nor RGB"),
+        ],
+    )
+    def test_a_tiff_that_the_decoder_would_misread_is_rejected(
+        self, tmp_path: Path, photometric: int, channels: int, planes: int, said: str
+    ) -> None:
+        pixels = b"".join([textured(np.uint16).tobytes()] * channels)
+        path = tmp_path / "frame.tif"
+        path.write_bytes(tiff(pixels, 16, photometric, channels, planes=planes))
+        assert said in rejection(path).detail
+
+    @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+    def test_the_opacity_of_a_tiff_does_not_darken_it(
+        self, tmp_path: Path, dtype: type[np.unsignedinteger[Any]]
+    ) -> None:
+        image = textured(dtype)
+        pixels = np.dstack([image, image, image, textured(dtype)[::-1]])
+        path = tmp_path / "frame.tif"
+        bits = 8 * image.dtype.itemsize
+        path.write_bytes(tiff(pixels.tobytes(), bits, 2, 4, opacity=2))
+        np.testing.assert_allclose(read_grey(path, CAMERA), image, atol=1.0)
+
+    @pytest.mark.parametrize("compression", ["tiff_lzw", "tiff_adobe_deflate", "jpeg"])
+    @pytest.mark.parametrize("log_level", ["WARNING", "SILENT"])
+    def test_a_damaged_strip_is_rejected_in_silence(
+        self,
+        tmp_path: Path,
+        capfd: pytest.CaptureFixture[str],
+        compression: str,
+        log_level: str,
+    ) -> None:
+        path = tmp_path / "frame.tif"
+        Image.fromarray(textured() & 0xE0).save(path, compression=compression)
+        data = path.read_bytes()
+        middle = len(data) // 2
+        path.write_bytes(data[:middle] + bytes(200) + data[middle + 200 :])
+        set_log_level = cv2.utils.logging.setLogLevel
+        before = set_log_level(getattr(cv2.utils.logging, f"LOG_LEVEL_{log_level}"))
+        try:
+            assert rejection(path).reason is Reason.DECODE_FAILED
+        finally:
+            set_log_level(before)
+        assert capfd.readouterr() == ("", "")
 
     @pytest.mark.parametrize("shape", [(1, 1), (WIDTH, HEIGHT), (HEIGHT, WIDTH + 1)])
     def test_another_size_is_rejected_with_both(

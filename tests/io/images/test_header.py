@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from kgcp.io.images.exif import Exif, read_exif
-from kgcp.io.images.header import image_size, is_greedy, upright
+from kgcp.io.images.header import image_size, is_greedy, with_stored_pixels
 
 SIZE = (43, 29)
 
@@ -26,7 +26,7 @@ def saved(form: str, **options: object) -> bytes:
 def test_the_size_of_a_frame_stands_in_its_header(form: str) -> None:
     data = saved(form)
     assert image_size(BytesIO(data)) == SIZE
-    assert upright(BytesIO(data)) == data
+    assert with_stored_pixels(BytesIO(data)) == data
     assert image_size(BytesIO(data[:5])) is None
 
 
@@ -38,7 +38,7 @@ def test_what_no_frame_may_be_has_no_size() -> None:
 @pytest.mark.parametrize("is_big", [False, True])
 def test_a_tiff_s_orientation_is_overwritten_and_nothing_else(*, is_big: bool) -> None:
     turned = saved("TIFF", tiffinfo={274: 6}, big_tiff=is_big)
-    made = upright(BytesIO(turned))
+    made = with_stored_pixels(BytesIO(turned))
     assert len(made) == len(turned)
     assert sum(one != other for one, other in zip(made, turned, strict=True)) == 1
     with Image.open(BytesIO(made)) as image:
@@ -55,7 +55,7 @@ def test_no_header_is_trusted(head: bytes, place: int, noise: bytes) -> None:
     data = head[:place] + noise + head[place + len(noise) :]
     size = image_size(BytesIO(data))
     assert size is None or len(size) == 2
-    assert len(upright(BytesIO(data))) == len(data)
+    assert len(with_stored_pixels(BytesIO(data))) == len(data)
 
 
 def tags_of_the_same_bytes(count: int, size: int, start: int) -> bytes:
