@@ -5,7 +5,6 @@ from __future__ import annotations
 import atexit
 import errno
 import gc
-import io
 import os
 import sys
 import time
@@ -18,6 +17,7 @@ from typing import Any, TextIO
 import click
 
 from kgcp import __version__
+from kgcp.cli.encodings import print_anything
 from kgcp.cli.shells import as_meant
 from kgcp.errors import KgcpError, KgcpWarning, SettingError
 from kgcp.pipeline.execution.threads import use_one_thread_each
@@ -88,23 +88,13 @@ def _open_all_streams() -> None:
             setattr(sys, name, open(number, mode, encoding="utf-8", closefd=False))  # noqa: SIM115 - to the end
 
 
-def _print_anything() -> None:
-    """Let streams replace characters that they cannot print, as the arrows on Windows' code pages.
-
-    Output that is redirected there has such an encoding, and would end the command.
-    """
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
-            stream.reconfigure(errors="replace")
-
-
 class Program(click.Group):
     """The `kgcp` command: imports a command when it is called, prints known errors as one line."""
 
     def main(self, *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401 - click's signature
         """Run the program; even its help has characters that not every stream can print."""
         _open_all_streams()
-        _print_anything()
+        print_anything(sys.stdout, sys.stderr)
         gc.set_threshold(_OBJECTS)
         atexit.register(gc.freeze)  # 0.2 s of searching what ends with the process anyway
         try:
