@@ -67,7 +67,7 @@ LIBRARIES: dict[str, frozenset[str]] = {
     "simulation": IMAGES,
     "quality": ARRAYS | {"scipy"},
     "io.files": ARRAYS | {"yaml"},
-    "io.images": IMAGES | {"PIL", "pyarrow"},
+    "io.images": IMAGES | {"PIL", "pyarrow", "simplejpeg"},
     "io.formats": ARRAYS | {"scipy", "pyproj"},
     "io.flight": ARRAYS | {"pyproj"},
     "io.tables": IMAGES | {"pandas", "PIL", "pyarrow"},

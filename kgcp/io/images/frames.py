@@ -15,6 +15,7 @@ from threading import Lock
 
 import cv2
 import numpy as np
+import simplejpeg
 
 from kgcp.errors import KgcpError, Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
@@ -25,7 +26,6 @@ from kgcp.io.images.header import (
     JPEG_END,
     JPEG_START,
     image_size,
-    is_cut_jpeg,
     is_cut_png,
     misread_pixels,
     with_stored_pixels,
@@ -61,15 +61,12 @@ _MAX_METADATA_BYTES = 1 << 26
 
 CORRECT_FOLDER = "correct [frames] folder in flight.toml"
 
-# Messages on stderr about data that decoders had to guess; they do not stop decoding. Those of
-# libjpeg may come through libtiff, whose own errors OpenCV prints after "TIFF_Error".
-_CUT_JPEG = "Premature end of JPEG file"
-_GUESSED_PIXELS = re.compile(
-    rf"Corrupt JPEG data.*|{_CUT_JPEG}.*|PackBitsDecode.*|(?<=TIFF_Error ).*"
-)
-# OpenCV for Windows is linked with a C library of its own, whose stderr may not follow Python's.
-# There, cut files are recognised by their missing end.
-_COLLECTS_DECODER_MESSAGES = os.name != "nt"
+# Messages of decoders about data that they had to guess; they do not stop decoding.
+_GUESSED_IN_JPEG = ("Corrupt JPEG data", "Premature end of JPEG file")
+# On stderr. Those of libjpeg come through libtiff, whose own errors OpenCV prints after
+# "TIFF_Error". OpenCV for Windows is linked with a C library of its own, whose stderr does not
+# follow Python's: there, damage to a compressed TIFF goes unnoticed.
+_GUESSED_IN_TIFF = re.compile(r"Corrupt JPEG data.*|PackBitsDecode.*|(?<=TIFF_Error ).*")
 _STDERR_LOCK = Lock()  # a process has only one stderr
 
 
@@ -251,21 +248,35 @@ def _require_size(width: int, height: int, camera: Camera) -> None:
 
 
 def _decode(encoded: bytes) -> GreyArray:
-    size = len(encoded)
-    if encoded.startswith(JPEG_START):
-        if not _COLLECTS_DECODER_MESSAGES and is_cut_jpeg(encoded):
-            raise Rejection(Reason.DECODE_FAILED, _CUT_JPEG)
-        # Truncated files get an end: then every version of the decoder notices the gap.
-        encoded += JPEG_END
-    grey = None
+    grey = _decode_jpeg(encoded) if encoded.startswith(JPEG_START) else None
+    if grey is not None:
+        return grey
     with _collected_stderr() as messages, suppress(cv2.error):
         grey = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), _RAW_GREY)
     if grey is None:
-        raise Rejection(Reason.DECODE_FAILED, f"{size} bytes that are not a complete image")
+        raise Rejection(Reason.DECODE_FAILED, f"{len(encoded)} bytes that are not a complete image")
     for message in messages:
-        if guess := _GUESSED_PIXELS.search(message):
+        if guess := _GUESSED_IN_TIFF.search(message):
             raise Rejection(Reason.DECODE_FAILED, guess[0])
     return grey
+
+
+def _decode_jpeg(encoded: bytes) -> GreyArray | None:
+    """Decode a JPEG to its luma; return None if this decoder cannot.
+
+    Raises
+    ------
+    Rejection
+        `DECODE_FAILED` if a part of the pixels would be guessed.
+    """
+    encoded += JPEG_END  # an end that alone is missing changes no pixels
+    for is_strict in (True, False):  # nor does what else a strict decoder complains of
+        try:
+            return np.asarray(simplejpeg.decode_jpeg(encoded, "GRAY", strict=is_strict)[..., 0])
+        except ValueError as error:
+            if str(error).startswith(_GUESSED_IN_JPEG):
+                raise Rejection(Reason.DECODE_FAILED, str(error)) from error
+    return None
 
 
 @contextmanager

@@ -9,7 +9,6 @@ has.
 
 from __future__ import annotations
 
-import re
 import struct
 import warnings
 from collections.abc import Iterator
@@ -23,7 +22,6 @@ FORMATS = ("BMP", "JPEG", "JPEG2000", "PNG", "PPM", "WEBP")
 
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 # Within pixels, 0xff is followed by 0 or by the number of a restart.
-_JPEG_MARKER = re.compile(rb"\xff[^\x00\x01\xd0-\xd7\xff]")
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _WIDTH, _HEIGHT, _ORIENTATION, _EXIF = 256, 257, 274, 34665
 _BITS, _PHOTOMETRIC, _SAMPLES, _PLANES, _EXTRA_SAMPLES = 258, 262, 277, 284, 338
@@ -189,17 +187,6 @@ def is_cut_png(data: bytes) -> bool:
         length, kind = struct.unpack_from(">I4s", data, place)
         place += length + 12
     return kind != b"IEND" or place > len(data)
-
-
-def is_cut_jpeg(data: bytes) -> bool:
-    """Return whether a JPEG ends before its end is marked."""
-    place = len(JPEG_START)
-    while marker := _JPEG_MARKER.search(data, place):
-        if marker[0] == JPEG_END:
-            return False
-        # skip the segment: a thumbnail in it has an end of its own
-        place = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2])
-    return True
 
 
 def _bits(stream: BinaryIO, layout: _Layout, entry: _Entry) -> int:

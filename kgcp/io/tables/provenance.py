@@ -258,6 +258,7 @@ def versions() -> dict[str, str]:
         "numpy": np.__version__,
         "scipy": version("scipy"),  # from the metadata: not every process imports scipy
         "opencv": cv2.__version__,
+        "simplejpeg": version("simplejpeg"),
         "numba": version("numba"),
         "pillow": PIL.__version__,
         "pyarrow": pa.__version__,
