@@ -24,7 +24,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises
     ------
     KgcpError
-        If the file that has the name is open in a program that keeps it, as on Windows.
+        If a folder has the name, or a file that is open in another program, on Windows.
     OSError
         If the file does not exist at the end, or cannot be renamed.
     """
@@ -37,8 +37,8 @@ def whole_file(path: Path) -> Iterator[Path]:
             os.fsync(written.fileno())
         try:
             replace(temporary, path)
-        except PermissionError as error:
-            raise _in_use(path) from error
+        except (IsADirectoryError, PermissionError) as error:
+            raise _refused(path) from error
     except BaseException:
         with suppress(OSError):  # it may not exist, or its folder be gone
             temporary.unlink()
@@ -55,13 +55,16 @@ def remove(path: Path) -> None:
     """
     try:
         path.unlink(missing_ok=True)
-    except PermissionError as error:
-        raise _in_use(path) from error
+    except (IsADirectoryError, PermissionError) as error:
+        raise _refused(path) from error
     except OSError as error:
         raise KgcpError(f"{path}: cannot be deleted ({error.strerror}); delete it") from error
 
 
-def _in_use(path: Path) -> KgcpError:
+def _refused(path: Path) -> KgcpError:
+    """Return the error of a file that may not be replaced or deleted."""
+    if path.is_dir():
+        return KgcpError(f"{path}: is a folder, kgcp needs this name for a file; rename the folder")
     return KgcpError(
         f"{path}: is open in another program, or protected; close it there, then repeat the command"
     )

@@ -19,9 +19,7 @@ def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
 
 def test_a_rename_that_fails_leaves_nothing(tmp_path: Path) -> None:
     (tmp_path / "a.txt" / "occupied").mkdir(parents=True)
-    with pytest.raises(
-        KgcpError, match=r"a\.txt: cannot be written .*; choose another results folder"
-    ):
+    with pytest.raises(KgcpError, match=r"a\.txt: is a folder, .*; rename the folder"):
         write_bytes(tmp_path / "a.txt", b"content")
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
 
@@ -50,7 +48,7 @@ def test_many_files_are_written_or_the_one_that_cannot_be_is_named(tmp_path: Pat
     write_all(contents)
     assert {path: path.read_bytes() for path in (tmp_path / "many").iterdir()} == contents
     (tmp_path / "7.txt" / "occupied").mkdir(parents=True)
-    with pytest.raises(KgcpError, match=r"7\.txt: cannot be written"):
+    with pytest.raises(KgcpError, match=r"7\.txt: is a folder"):
         write_all({tmp_path / f"{number}.txt": b"" for number in range(9)})
     assert not [*tmp_path.glob(".*.part")]
 
@@ -110,5 +108,5 @@ def test_a_file_that_is_open_for_a_moment_is_replaced(
 def test_what_cannot_be_deleted_is_told(tmp_path: Path) -> None:
     remove(tmp_path / "not there")
     (tmp_path / "a").mkdir()
-    with pytest.raises(KgcpError, match=r"a: cannot be deleted \(Is a directory\); delete it"):
+    with pytest.raises(KgcpError, match=r"a: is a folder"):
         remove(tmp_path / "a")
