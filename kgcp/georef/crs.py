@@ -22,6 +22,8 @@ WGS84_3D = "EPSG:4979"
 """Longitude, latitude and ellipsoidal height of WGS 84."""
 MAX_HEIGHT = 1e5
 """Largest credible height [m or ft], beyond any vehicle or aircraft."""
+_YEAR_S = 365.2425 * 86400.0
+_EARLIEST_S = 10.0 * _YEAR_S  # 1980, before GPS; times that count from a flight's start are earlier
 
 
 def crs_of(text: str) -> CRS:
@@ -89,9 +91,13 @@ def best_transformer(
     KgcpError
         If no exact operation is known, or the best one needs a grid that is not installed.
     """
+    unknown = KgcpError(f"{where} is not known exactly; {remedy}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a missing grid is an error below
-        operations = TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
+        try:
+            operations = TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
+        except IndexError:  # pyproj's, if PROJ knows operations and can use none of them
+            raise unknown from None
     if operations.best_available and operations.transformers:
         return Transformer.from_crs(
             source, target, always_xy=True, only_best=True, allow_ballpark=False
@@ -103,24 +109,64 @@ def best_transformer(
             f"{where} needs the grid {', '.join(missing)}, which is not installed; install it with"
             f" 'pyproj sync --file {missing[0]}', or {remedy}"
         )
-    raise KgcpError(f"{where} is not known exactly; {remedy}")
+    raise unknown
 
 
-def convert_positions(file: str, position: FloatArray, source: str, target: str) -> FloatArray:
-    """Transform a trajectory's positions (n, 3), read from a file, from one CRS to another.
+def transformation_year(
+    transformer: Transformer, point: FloatArray, time_s: float | None, where: str
+) -> float | None:
+    """Return the date at which to transform, as a year; None: the operation needs none.
+
+    Global frames such as ITRF and those that move with a continent (ETRS89, NAD83, GDA2020) drift
+    apart by centimetres a year. Without a date, PROJ silently takes the epoch of its parameters and
+    is decimetres off.
+
+    Parameters
+    ----------
+    point : (3,) array
+        A place of the coordinates, in the operation's source.
+    time_s : float or None
+        When they were measured, Unix UTC [s]; None: not known.
+    where : str
+        Beginning of the message: which transformation it is.
 
     Raises
     ------
     KgcpError
-        As `best_transformer`, or if a point is outside the operation's domain or higher than
-        `MAX_HEIGHT`.
+        If the operation depends on a date that is not known.
     """
-    transformer = best_transformer(
-        parse_crs(source, VEHICLE_CRS),
-        parse_crs(target),
-        f"{file}: the transformation from {source!r} to the flight's crs {target!r}",
+    one, other = (transform_points(transformer, point[None], year) for year in (2000.0, 2020.0))
+    if np.array_equal(one, other, equal_nan=True):
+        return None
+    if time_s is None or time_s < _EARLIEST_S:
+        raise KgcpError(
+            f"{where} depends on the date, because frames of reference drift apart, and the date is"
+            " not known; transform the coordinates beforehand"
+        )
+    return 1970.0 + time_s / _YEAR_S
+
+
+def convert_positions(
+    file: str, position: FloatArray, source: str, target: str, time_s: float
+) -> FloatArray:
+    """Transform a trajectory's positions (n, 3), read from a file, from one CRS to another.
+
+    Parameters
+    ----------
+    time_s : float
+        The date of all positions, Unix UTC [s].
+
+    Raises
+    ------
+    KgcpError
+        As `best_transformer` and `transformation_year`, or if a point is outside the operation's
+        domain or higher than `MAX_HEIGHT`.
+    """
+    where = f"{file}: the transformation from {source!r} to the flight's crs {target!r}"
+    transformer = best_transformer(parse_crs(source, VEHICLE_CRS), parse_crs(target), where)
+    converted = transform_points(
+        transformer, position, transformation_year(transformer, position[0], time_s, where)
     )
-    converted = np.column_stack(transformer.transform(*position.T))
     is_valid = np.isfinite(converted).all(axis=1)
     if not parse_crs(target).is_geocentric:
         is_valid &= np.abs(converted[:, 2]) < MAX_HEIGHT
@@ -134,21 +180,37 @@ def convert_positions(file: str, position: FloatArray, source: str, target: str)
     return converted
 
 
+def transform_points(
+    transformer: Transformer, points: FloatArray, year: float | None, *, errcheck: bool = False
+) -> FloatArray:
+    """Transform points (n, 3) at a date of `transformation_year`.
+
+    Raises
+    ------
+    ProjError
+        With `errcheck`, if a point cannot be transformed; without it, such points are infinite.
+    """
+    x, y, z = points.T
+    if year is None:
+        return np.column_stack(transformer.transform(x, y, z, errcheck=errcheck))
+    years = np.full(len(points), year)
+    return np.column_stack(transformer.transform(x, y, z, years, errcheck=errcheck)[:3])
+
+
 def wgs84_from_map(crs: str, positions: Sequence[FloatArray], where: str) -> FloatArray:
     """Return longitude, latitude [deg] and ellipsoidal height [m] (n, 3) of map points (n, 3).
 
     Raises
     ------
     KgcpError
-        As `best_transformer`; `where` is the format's name.
+        As `best_transformer`, or if the operation depends on a date; `where` is the format's name.
     """
     if not positions:
         return np.empty((0, 3))
-    to_wgs84 = best_transformer(
-        parse_crs(crs), parse_crs(WGS84_3D), f"{where}: the transformation from {crs!r} to WGS 84"
-    )
-    x, y, z = np.array(positions).T
-    return np.column_stack(to_wgs84.transform(x, y, z, errcheck=True))
+    where = f"{where}: the transformation from {crs!r} to WGS 84"
+    to_wgs84 = best_transformer(parse_crs(crs), parse_crs(WGS84_3D), where)
+    year = transformation_year(to_wgs84, positions[0], None, where)
+    return transform_points(to_wgs84, np.array(positions), year, errcheck=True)
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,8 @@ from kgcp.georef.crs import (
     best_transformer,
     geographic_of,
     parse_crs,
+    transform_points,
+    transformation_year,
     unusable,
 )
 
@@ -252,42 +254,54 @@ class CrsTransform:
     source: LocalFrame  # of the flight's CRS
     target: LocalFrame  # of the other CRS
     _between: Transformer
+    _year: float | None  # the date of the coordinates, if it matters
     _where: str
 
     @classmethod
-    def to(cls, crs: str, source: LocalFrame, near_map: FloatArray, where: str = "crs") -> Self:
+    def to(
+        cls,
+        crs: str,
+        source: LocalFrame,
+        near_map: FloatArray,
+        where: str = "crs",
+        *,
+        time_s: float | None = None,
+    ) -> Self:
         """Prepare the transformation to `crs` (anything pyproj reads).
 
-        The target's frame has its origin at `near_map` (3,), a point of the source map. `where`
-        tells where the CRS was given; error messages begin with it.
+        Parameters
+        ----------
+        near_map : (3,) array
+            A point of the source map; the target's frame has its origin there.
+        where : str
+            Where the CRS was given; error messages begin with it.
+        time_s : float or None
+            When the coordinates were measured, Unix UTC [s]; None: not known.
 
         Raises
         ------
         KgcpError
             If the CRS is unknown or unusable, if no exact operation leads to it, or if that
-            operation needs a grid that is not installed.
+            operation needs a grid that is not installed, or a date that is not known.
         """
-        between = best_transformer(
-            parse_crs(source.crs),
-            parse_crs(crs, where),
-            f"{where} {crs!r}: the transformation from {source.crs!r}",
-        )
-        draft = cls(source, source, between, where)
+        way = f"{where} {crs!r}: the transformation from {source.crs!r}"
+        between = best_transformer(parse_crs(source.crs), parse_crs(crs, where), way)
+        year = transformation_year(between, near_map, time_s, way)
+        draft = cls(source, source, between, year, where)
         target = LocalFrame.at(crs, draft.positions(np.reshape(near_map, (1, 3)))[0], where)
-        return cls(source, target, between, where)
+        return cls(source, target, between, year, where)
 
     def positions(self, xyz: FloatArray) -> FloatArray:
         """Transform points (n, 3) of the source map into the other one (n, 3)."""
-        x, y, z = np.asarray(xyz, dtype=np.float64).T
+        points = np.asarray(xyz, dtype=np.float64)
         try:
-            transformed = np.column_stack(self._between.transform(x, y, z, errcheck=True))
+            return transform_points(self._between, points, self._year, errcheck=True)
         except ProjError as error:
             text = " ".join(str(error).split())
             raise KgcpError(
                 f"{self._where}: points in {self.source.crs!r} cannot be transformed to that CRS"
                 f" ({text}); give one that covers the flight"
             ) from error
-        return transformed
 
     def axes(self, xyz: FloatArray) -> FloatArray:
         """Return the rotations (..., 3, 3) from the source map's axes to the other's at (..., 3).

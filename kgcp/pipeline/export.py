@@ -116,7 +116,8 @@ def make_gcps(
         raise KgcpError(explain_empty_selection(placed, unwanted, selection))
     consistency, doubts = inputs.compared(sightings)
     if crs is not None and gcps:
-        transform = CrsTransform.to(crs, local_frame, np.asarray(gcps[0].position_map))
+        time_s = next((point.time_s for point in gcps if point.time_s is not None), None)
+        transform = CrsTransform.to(crs, local_frame, gcps[0].position_map, time_s=time_s)
         gcps, local_frame = transform_gcps(gcps, transform), transform.target
     return GcpSet(
         flight=flight,

@@ -13,7 +13,7 @@ import pytest
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.crs import best_transformer, parse_crs
+from kgcp.georef.crs import best_transformer, convert_positions, parse_crs, wgs84_from_map
 from kgcp.georef.gcp import Gcp, transform_gcps
 from kgcp.georef.local_frame import CrsTransform, LocalFrame
 
@@ -147,6 +147,62 @@ def test_no_way_is_better_than_a_second_best_one() -> None:
         _change("EPSG:25831", "EPSG:4978", _UTM31)
     with pytest.raises(KgcpError, match="crs 'nonsense'"):
         _change("EPSG:25831", "nonsense", _UTM31)
+
+
+_CANBERRA = np.array([149.0, -35.0, 600.0])  # longitude, latitude, height in ITRF2014
+_IN_2026_S = 1_781_568_000.0  # 2026-06-16
+# by which Australia turns in ITRF2014, about x, y, z [mas/year] (GDA2020 Technical Manual, table 3)
+_AUSTRALIA_MAS = np.array([1.50379, 1.18346, 1.20716])
+
+
+def _drift_m(years: float) -> FloatArray:
+    """Return by how much Canberra moves north and east in ITRF2014, on a sphere [m]."""
+    longitude, latitude = np.radians(_CANBERRA[:2])
+    place = 6.3715e6 * np.array(
+        [
+            math.cos(latitude) * math.cos(longitude),
+            math.cos(latitude) * math.sin(longitude),
+            math.sin(latitude),
+        ]
+    )
+    moved = years * np.cross(np.radians(_AUSTRALIA_MAS / 3.6e6), place)
+    east = np.array([-math.sin(longitude), math.cos(longitude), 0.0])
+    return np.array([moved @ east, moved[2] / math.cos(latitude)])
+
+
+def test_a_continent_drifts_until_the_day_of_the_trajectory() -> None:
+    east_m, north_m = _drift_m(2026.0 + 166.0 / 365.0 - 2020.0)
+    assert math.hypot(east_m, north_m) > 0.3
+    fixed = convert_positions("t.csv", _CANBERRA[None], "EPSG:7912", "EPSG:7843", _IN_2026_S)[0]
+    metres = np.radians(fixed[:2] - _CANBERRA[:2]) * 6.3715e6
+    assert metres[0] * math.cos(math.radians(-35.0)) == pytest.approx(-east_m, abs=2e-3)
+    assert metres[1] == pytest.approx(-north_m, abs=2e-3)
+
+
+def test_points_on_another_map_are_those_of_their_day() -> None:
+    source = LocalFrame.at("EPSG:7843", _CANBERRA)
+    transform = CrsTransform.to("EPSG:7912", source, _CANBERRA, time_s=_IN_2026_S)
+    there = transform.positions(_CANBERRA[None])
+    back = convert_positions("t.csv", there, "EPSG:7912", "EPSG:7843", _IN_2026_S)
+    np.testing.assert_allclose(back[0], _CANBERRA, atol=1e-9)
+
+
+@pytest.mark.parametrize("time_s", [None, 12.5])  # none, or since the start of the flight
+def test_frames_that_drift_apart_need_a_date(time_s: float | None) -> None:
+    source = LocalFrame.at("EPSG:7843", _CANBERRA)
+    with pytest.raises(KgcpError, match=r"^crs 'EPSG:7912': .* depends on the date"):
+        CrsTransform.to("EPSG:7912", source, _CANBERRA, time_s=time_s)
+    CrsTransform.to("EPSG:7855", source, _CANBERRA, time_s=time_s)  # both move with Australia
+
+
+def test_wgs84_is_not_reached_without_a_date_where_it_matters() -> None:
+    with pytest.raises(KgcpError, match=r"^geojson: .* depends on the date"):
+        wgs84_from_map("EPSG:7910", [_CANBERRA], "geojson")  # ITRF2005
+
+
+def test_operations_none_of_which_is_usable_are_an_error() -> None:
+    with pytest.raises(KgcpError, match="is not known exactly"):
+        wgs84_from_map("EPSG:7678", [np.array([40.0, 50.0, 100.0])], "geojson")  # PZ-90.02
 
 
 _WITHOUT_GRIDS = """

@@ -103,7 +103,8 @@ def _refuse_foreign_keys(form: str, options: TrajectoryFileOptions) -> None:
 
 def _on_map(path: Path, epochs: Epochs, crs: str) -> Epochs:
     """Transform positions and their covariances to the flight's CRS."""
-    position = convert_positions(str(path), epochs.position, epochs.crs, crs)
+    time_s = float(epochs.time_s[0])
+    position = convert_positions(str(path), epochs.position, epochs.crs, crs, time_s)
     cov = epochs.cov_position_m2
     if cov is None and epochs.sd_position_m is not None:
         cov = epochs.sd_position_m[:, :, None] ** 2 * np.eye(3)
