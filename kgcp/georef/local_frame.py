@@ -23,6 +23,7 @@ from kgcp.georef.crs import (
     VEHICLE_CRS,
     best_transformer,
     geographic_of,
+    is_geographic,
     parse_crs,
     transform_points,
     transformation_year,
@@ -126,8 +127,11 @@ class LocalFrame:
         steps = _JACOBIAN_STEP_M * np.vstack((np.eye(3), -np.eye(3)))
         around = np.asarray(enu, dtype=np.float64)[..., None, :] + steps
         moved = self.map_from_enu(around.reshape(-1, 3)).reshape(around.shape)
-        differences = (moved[..., :3, :] - moved[..., 3:, :]) / (2.0 * _JACOBIAN_STEP_M)
-        return np.asarray(np.swapaxes(differences, -1, -2))
+        differences = moved[..., :3, :] - moved[..., 3:, :]
+        if is_geographic(self.crs):  # longitudes jump by a whole turn at the antimeridian
+            turn = 2.0 * np.pi / self._radians_per_unit
+            differences[..., 0] -= turn * np.round(differences[..., 0] / turn)
+        return np.asarray(np.swapaxes(differences, -1, -2)) / (2.0 * _JACOBIAN_STEP_M)
 
     def grid_rotation(self, enu: FloatArray) -> FloatArray:
         """Return the rotations (..., 3, 3) from the map's axes to ENU at points (..., 3).

@@ -145,6 +145,14 @@ def test_coordinates_outside_the_projection_are_an_error() -> None:
         LocalFrame.at("EPSG:25831", np.array([1e30, 0.0, 0.0]))
 
 
+def test_the_axes_are_those_of_east_and_north_also_at_the_antimeridian() -> None:
+    for crs, half_turn in (("EPSG:4326", 180.0), ("EPSG:4807", 200.0)):  # the latter in grads
+        local_frame = LocalFrame.at(crs, np.array([half_turn - 1e-5, -17.0, 0.0]))
+        np.testing.assert_allclose(local_frame.grid_rotation(np.zeros(3)), np.eye(3), atol=1e-6)
+        east = local_frame.map_from_enu(np.array([[20.0, 0.0, 0.0]]))[0]
+        assert east[0] == pytest.approx(-half_turn, abs=1e-3)
+
+
 def test_left_handed_axes_are_refused() -> None:
     local_frame = LocalFrame.at("EPSG:2065", np.array([700000.0, 1100000.0, 200.0]))
     with pytest.raises(KgcpError, match="left-handed"):
