@@ -116,6 +116,8 @@ def read_frame_header(path: Path, frame: str) -> FrameHeader:
         longitude_deg = _angle_deg(tags.gps, GPS.GPSLongitude, GPS.GPSLongitudeRef, "W", 180.0)
         latitude_deg = _angle_deg(tags.gps, GPS.GPSLatitude, GPS.GPSLatitudeRef, "S", 90.0)
         has_position = longitude_deg is not None and latitude_deg is not None
+        if longitude_deg == latitude_deg == 0.0:  # written by cameras without a fix
+            has_position = False
         size_px = tags.size_px or _size_px(path)
         return FrameHeader(
             frame,
@@ -156,12 +158,12 @@ def _size_px(path: Path) -> tuple[int, int] | None:
 def _angle_deg(
     gps: Mapping[int, Any], tag: GPS, reference: GPS, negative: str, limit: float
 ) -> float | None:
-    """Return a longitude or latitude of degrees, minutes and seconds; 0 means no fix."""
+    """Return a longitude or latitude of degrees, minutes and seconds."""
     parts = gps.get(tag)
     if not isinstance(parts, tuple) or len(parts) != 3:
         return None
     degrees = sum(float(part) / 60.0**power for power, part in enumerate(parts))
-    if not 0.0 < degrees <= limit:
+    if not 0.0 <= degrees <= limit:
         return None
     return -degrees if _text(gps, reference).upper() == negative else degrees
 

@@ -15,7 +15,16 @@ from kgcp.quality.checks.frame_header import FrameHeader
 XMP = b'<x:xmpmeta><rdf:Description drone-dji:RelativeAltitude="%s"/></x:xmpmeta>'
 
 
-def write(path: Path, altitude: bytes = b"+40.10", latitude: str = "N") -> None:
+PLACE = ((46.0, 50.0, 34.5), (91.0, 59.0, 38.25))
+ZERO = (0.0, 0.0, 0.0)
+
+
+def write(
+    path: Path,
+    altitude: bytes = b"+40.10",
+    latitude: str = "N",
+    place: tuple[tuple[float, ...], tuple[float, ...]] = PLACE,
+) -> None:
     image = Image.fromarray(np.full((48, 64), 90, dtype=np.uint8))
     exif = Image.Exif()
     exif[Base.Make], exif[Base.Model] = "DJI\0", "FC300S"
@@ -23,9 +32,9 @@ def write(path: Path, altitude: bytes = b"+40.10", latitude: str = "N") -> None:
     exif.get_ifd(IFD.GPSInfo).update(
         {
             GPS.GPSLatitudeRef: latitude,
-            GPS.GPSLatitude: (46.0, 50.0, 34.5),
+            GPS.GPSLatitude: place[0],
             GPS.GPSLongitudeRef: "W",
-            GPS.GPSLongitude: (91.0, 59.0, 38.25),
+            GPS.GPSLongitude: place[1],
         }
     )
     image.save(path, exif=exif, xmp=XMP % altitude)
@@ -48,6 +57,24 @@ def test_the_south_and_altitudes_below_take_off(tmp_path: Path) -> None:
     header = read_frame_header(tmp_path / "a.jpg", "a.jpg")
     assert header.latitude_deg == pytest.approx(-46.84292, abs=1e-5)
     assert header.altitude_m == -3.5
+
+
+@pytest.mark.parametrize(
+    ("place", "expected"),
+    [
+        ((PLACE[0], ZERO), (pytest.approx(46.84292, abs=1e-5), 0.0)),  # on Greenwich's meridian
+        ((ZERO, PLACE[1]), (0.0, pytest.approx(-91.99396, abs=1e-5))),  # on the equator
+        ((ZERO, ZERO), (None, None)),  # no fix
+    ],
+)
+def test_one_angle_of_zero_is_a_place(
+    tmp_path: Path,
+    place: tuple[tuple[float, ...], tuple[float, ...]],
+    expected: tuple[object, object],
+) -> None:
+    write(tmp_path / "a.jpg", place=place)
+    header = read_frame_header(tmp_path / "a.jpg", "a.jpg")
+    assert (header.latitude_deg, header.longitude_deg) == expected
 
 
 def test_what_is_absent_or_damaged_is_none(tmp_path: Path) -> None:
