@@ -28,9 +28,9 @@ from kgcp.io.tables.gcps import GCP_COLUMNS, gcp_row
 from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.provenance import derived_provenance
 from kgcp.pipeline.execution.threads import single_threaded
-from kgcp.pipeline.flight_inputs import FlightInputs, naming_causes
+from kgcp.pipeline.flight_inputs import FlightInputs, missing_frames, naming_causes
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
-from kgcp.quality.checks.doubt import Doubt
+from kgcp.quality.checks.doubt import Doubt, ranked
 from kgcp.quality.consistency import Consistency
 from kgcp.quality.number_text import rounded
 
@@ -133,7 +133,7 @@ def make_gcps(
             {"selection": asdict(selection), "crs": crs},
             has_reference=data.has_reference,
         ),
-        doubts=doubts,
+        doubts=ranked((*doubts, *missing_frames(flight, sightings))),
     )
 
 

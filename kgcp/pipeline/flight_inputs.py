@@ -23,6 +23,7 @@ from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.frame_times import FrameTimes
 from kgcp.io.images.exif import read_frame_header
+from kgcp.io.images.frames import list_frames
 from kgcp.io.images.remote import StoredFolder, at_hand
 from kgcp.quality.checks.calibration import check_camera
 from kgcp.quality.checks.camera_position import check_camera_position
@@ -355,6 +356,26 @@ def missing_files(flight: Flight) -> tuple[Doubt, ...]:
         )
         for file, key, command in named
         if not file.exists()
+    )
+
+
+def missing_frames(flight: Flight, sightings: Sequence[Sighting]) -> tuple[Doubt, ...]:
+    """Return a doubt if frames of sightings are gone from a folder that still has others."""
+    try:
+        present = {*list_frames(flight.frames_folder)}
+    except KgcpError:  # in an archive or a store
+        return ()
+    frames = sorted({sighting.frame for sighting in sightings})
+    missing = [frame for frame in frames if frame not in present]
+    if len(missing) in (0, len(frames)):
+        return ()
+    return (
+        mild(
+            Cause.UNREADABLE,
+            f"{flight.frames_folder}: frames with the target that are not there any more:"
+            f" {len(missing)} of {len(frames)} ({missing[0]}{', …' if len(missing) > 1 else ''})",
+            "repeat 'kgcp detect' if they are not to be used",
+        ),
     )
 
 
