@@ -25,8 +25,9 @@ here from the plate and its vehicle's attitude, for the images that show the tar
 1. colmap feature_extractor --database_path database.db --image_path frames
    (images go by their path below that folder, as in pose_priors.csv)
 2. python add_pose_priors.py database.db        needs pycolmap (pip install pycolmap)
-   It replaces priors of these images, and leaves those of others, such as GPS from EXIF: those are
-   WGS 84 and cannot be mixed with these Cartesian ones. Add --only to remove them.
+   It replaces priors of these images, keeps those of others and says how many. Add --only to remove
+   them: GPS from EXIF is WGS 84 and cannot be mixed with these Cartesian priors, and those of an
+   earlier export may be in a frame of another origin.
 3. colmap exhaustive_matcher --database_path database.db        or another matcher
 4. colmap pose_prior_mapper --database_path database.db --image_path frames --output_path sparse
    without --overwrite_priors_covariance, which would discard the covariances.

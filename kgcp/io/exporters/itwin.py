@@ -37,7 +37,8 @@ iTwin Capture Modeler, ContextCapture
 Into a block that you have already:
 1. Export the block as BlocksExchange XML.
 2. python add_to_block.py BLOCK.xml
-   writes BLOCK_kgcp.xml: the same block with kgcp's points. Photos are found by their file names;
+   writes BLOCK_kgcp.xml: the same block with kgcp's points, without the moving points of an earlier
+   export. Photos are found by their file names;
    those of several flights that have the same name, by a folder with the flight's name. The script
    prints which ones are not in the block. It needs Python, and nothing else.
 3. Import BLOCK_kgcp.xml as a block, and submit the aerotriangulation with control points.
@@ -47,7 +48,9 @@ images (paths are relative to it) and import it.
 
 Coordinates are in {crs}, x is easting or longitude;
 z is {heights}. Choose the
-vertical system of the block accordingly. Points kept for checking are check points.
+vertical system of the block accordingly. Points kept for checking are check points. Accuracies are
+metres. Bentley does not document their unit for a system in feet, nor that of the heights: export
+points of such a system in one in metres (kgcp export-gcp --crs).
 
 A moving point is measured in one photo only. iTwin Capture wants three or more control points with
 two or more measurements each to orient a block by them: use it with the photos' own positions, or

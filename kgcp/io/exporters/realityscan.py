@@ -36,6 +36,8 @@ RealityScan 2, RealityCapture
    X Accuracy, Y Accuracy, Alt Accuracy; separator: comma; coordinate system as above.
    checkpoints.csv, if it is here, has the points kept for checking: import it likewise, select its
    points and set their type to Ground Test.
+   Accuracies are metres. RealityScan's help does not give their unit for a system in feet, nor that
+   of the heights: export points of such a system in one in metres (kgcp export-gcp --crs).
 3. Workflow > Import Metadata > Control Points: measurements.csv. File format: Image, Point, X, Y,
    Accuracy; separator: comma. If images are not found, their names lack the extension in your
    project: kgcp export-gcp --image-names without-extension.

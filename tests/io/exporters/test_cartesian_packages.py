@@ -249,6 +249,28 @@ def test_colmap_reads_the_priors_from_its_database(
         )
 
 
+def test_colmap_says_that_priors_of_other_images_stay(
+    points: MapPoints,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    database_path = tmp_path / "database.db"
+    _make_database(pycolmap, database_path, ["a/IMG_1.JPG", "a/IMG_3.JPG"])
+    script = str(tmp_path / "colmap" / "add_pose_priors.py")
+    fewer = replace(points, priors=points.priors[:1])
+    for exported, arguments, kept in ((points, [], 0), (fewer, [], 1), (fewer, ["--only"], 0)):
+        export(exported, "colmap", tmp_path)
+        monkeypatch.setattr(sys, "argv", [script, str(database_path), *arguments])
+        runpy.run_path(script, run_name="__main__")
+        text = capsys.readouterr().out
+        assert ("pose priors of other images kept: 1" in text) == bool(kept)
+        database = pycolmap.Database.open(database_path)
+        assert len(database.read_all_pose_priors()) == len(exported.priors[:2]) + kept
+        database.close()
+
+
 def _make_database(pycolmap: ModuleType, path: Path, names: list[str]) -> None:
     database = pycolmap.Database.open(path)
     camera = pycolmap.Camera(

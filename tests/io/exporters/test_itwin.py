@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import runpy
 import sys
 from collections.abc import Callable
@@ -201,6 +202,25 @@ def test_the_script_adds_the_points_to_a_block(
     assert "3 control points in" in text
     assert "4 photos are not in the block" in text
     assert "a/IMG_2.JPG, a/IMG_4.JPG, a/IMG_5.JPG, a/IMG_6.JPG" in text
+
+
+def test_moving_points_of_an_earlier_export_are_removed(
+    points: MapPoints,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    one = "<Measurement><PhotoId>7</PhotoId><x>5</x><y>6</y></Measurement>"
+    names = {"K0099": one, "K0100": 2 * one, "south-K0099": one, "pillar": one}
+    before = "".join(
+        f"<ControlPoint><Name>{name}</Name>{marks}</ControlPoint>" for name, marks in names.items()
+    )
+    block = BLOCK % f"<ControlPoints>{before}</ControlPoints>"
+    result = add_to_block(points, tmp_path, block, monkeypatch)
+    document = result.read_text(encoding="utf-8")
+    left = re.findall(r"<ControlPoint>\s*<Name>(.*?)<", document)
+    assert left == ["K0100", "south-K0099", "pillar", "K0001", "K0003", "north_gate"]
+    assert "moving points of an earlier export removed: 1" in capsys.readouterr().out
 
 
 def test_names_that_repeat_are_told_apart_by_their_folders(
