@@ -76,7 +76,7 @@ class LocalFrame:
             raise KgcpError(f"{where} {crs!r} has no ellipsoid; give a CRS that has one")
         geodetic_from_map = best_transformer(
             horizontal,
-            geodetic.to_3d(),
+            geodetic.to_2d().to_3d(),  # in metres, also if the heights of `geodetic` are in feet
             f"{where} {crs!r}: the transformation from its heights to ellipsoidal ones",
             "give ellipsoidal heights and the horizontal CRS alone",
         )

@@ -82,6 +82,20 @@ def test_us_survey_feet_are_converted_but_ellipsoidal_heights_are_metres() -> No
     assert moved[1, 2] == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("crs", "place"),
+    [
+        ("+proj=longlat +ellps=GRS80 +vunits=us-ft +type=crs", [-75.0, 40.0, 100.0]),
+        ("+proj=utm +zone=18 +ellps=GRS80 +vunits=us-ft +type=crs", [500000.0, 4400000.0, 100.0]),
+    ],
+)
+def test_a_crs_may_have_its_heights_in_feet(crs: str, place: list[float]) -> None:
+    local_frame = LocalFrame.at(crs, np.array(place))
+    above = local_frame.enu_from_map(np.array([place]) + np.array([0.0, 0.0, 100.0]))[0]
+    assert above[2] == pytest.approx(100.0 * 1200.0 / 3937.0, abs=1e-6)
+    assert local_frame.map_from_enu(above[None])[0, 2] == pytest.approx(place[2] + 100.0, abs=1e-6)
+
+
 def test_grads_and_another_prime_meridian_make_no_difference_to_lengths() -> None:
     local_frame = LocalFrame.at(
         "EPSG:4807", np.array([2.0, 50.0, 0.0])

@@ -59,9 +59,13 @@ class MapPoints:
 
     @property
     def written_crs(self) -> CRS:
-        """The CRS as files state it: with its way to WGS 84, and two axes unless it is compound."""
+        """The CRS as files state it: with its way to WGS 84, and without ellipsoidal heights.
+
+        These are in metres where a file does not state them. Other ones are kept.
+        """
         crs = _parsed(self.crs)
-        return crs if crs.is_compound or crs.is_bound else crs.to_2d()
+        is_whole = crs.is_compound or crs.is_bound or _has_heights_in_feet(crs)
+        return crs if is_whole else crs.to_2d()
 
     @property
     def horizontal_epsg(self) -> int | None:
@@ -129,6 +133,10 @@ def _without_datum_shift(crs: str) -> CRS:
     while parsed.is_bound and parsed.source_crs is not None:
         parsed = parsed.source_crs
     return parsed
+
+
+def _has_heights_in_feet(crs: CRS) -> bool:
+    return len(crs.axis_info) > 2 and crs.axis_info[2].unit_conversion_factor != 1.0
 
 
 @lru_cache(maxsize=8)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 
 from kgcp.errors import KgcpError
 from kgcp.io.exporters import metashape, opensfm, opf, pix4d
@@ -152,6 +152,16 @@ def test_the_scene_frame_brings_points_near_zero_in_right_handed_metres(
         at_first = np.array(gcps[0].geolocation.coordinates) * step.scale
         offset = near - ((at_first[[1, 0, 2]] if swaps else at_first) + step.shift)
         np.testing.assert_allclose(offset, [east, north, up], atol=1e-6)
+
+
+def test_ellipsoidal_heights_in_feet_are_stated_or_refused(points: MapPoints) -> None:
+    crs = "+proj=utm +zone=31 +ellps=GRS80 +units=us-ft +vunits=us-ft +type=crs"
+    in_feet = replace(points, crs=crs, priors=())
+    (gcp, *_) = json.loads(opf.files(in_feet)["opf/input_control_points.json"])["gcps"]
+    stated = CRS.from_user_input(gcp["geolocation"]["crs"]["definition"])
+    assert [axis.unit_name for axis in stated.axis_info] == 3 * ["US survey foot"]
+    with pytest.raises(KgcpError, match="has no form that Metashape reads"):
+        metashape.files(in_feet)
 
 
 def test_opf_keeps_the_datum_of_a_proj_string(points: MapPoints) -> None:
