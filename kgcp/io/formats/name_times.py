@@ -28,6 +28,8 @@ def times_of_names(frames: Sequence[str]) -> dict[str, float] | None:
     frames : sequence of str
         Paths below the frames folder.
     """
+    if _are_counted(frames):
+        return None
     times: dict[str, float] = {}
     for frame in frames:
         time_s = _time_s(PurePosixPath(frame).stem)
@@ -35,6 +37,15 @@ def times_of_names(frames: Sequence[str]) -> dict[str, float] | None:
             return None
         times[frame] = time_s
     return times if len(set(times.values())) == len(times) else None
+
+
+def _are_counted(frames: Sequence[str]) -> bool:
+    """Whether six digits after the seconds count frames: 1781597705_000012, 1781597705_000013."""
+    matches = [_SECONDS.search(PurePosixPath(frame).stem) for frame in frames]
+    digits = [match[3] for match in matches if match is not None and match[3] is not None]
+    numbers = sorted(map(int, digits))
+    is_series = numbers == [*range(numbers[0], numbers[0] + len(numbers))] if numbers else False
+    return is_series and len(numbers) == len(frames) > 1
 
 
 def _time_s(stem: str) -> float | None:

@@ -23,6 +23,13 @@ def test_times_in_names(stem: str, time_s: float) -> None:
     assert times[f"cam/{stem}.png"] == pytest.approx(time_s, abs=1e-6)
 
 
+def test_microseconds_are_no_numbers_of_frames() -> None:
+    names = ["1781597705_000336.png", "1781597706_500540.png", "1781597708_000338.png"]
+    times = times_of_names(names)
+    assert times is not None
+    assert times[names[1]] == pytest.approx(1781597706.50054, abs=1e-6)
+
+
 @pytest.mark.parametrize(
     "names",
     [
@@ -32,6 +39,7 @@ def test_times_in_names(stem: str, time_s: float) -> None:
         ["1781597705.png"],
         ["20261316T081505.5Z.png"],
         ["1781597705.5.png", "other.png"],
+        ["1781597705_000012.png", "1781597705_000013.png", "1781597706_000014.png"],  # counted
         ["a/1781597705.5.png", "b/1781597705.5.png"],  # two frames of one moment
     ],
 )
