@@ -28,7 +28,7 @@ WORST, SPREAD = 12, 24
 
 BIN_M = 10.0
 NEAR_M = 50.0  # the paper states accuracies below and above this distance
-_BIASED_SIGMAS = 3.0
+BIASED_SIGMAS = 3.0  # of noise and reference together; a larger error is a bias
 _RADIUS_PX, _RADII_PER_OCTAVE = 13.0, 2.0  # borders at 13 px and at every factor of √2 from there
 
 
@@ -57,7 +57,7 @@ class RangeRow:
     def is_biased(self) -> bool:
         """Whether noise and errors of the reference do not explain the mean error."""
         sd = self.sd_mean_percent
-        return sd is not None and abs(self.percent.mean) > _BIASED_SIGMAS * sd
+        return sd is not None and abs(self.percent.mean) > BIASED_SIGMAS * sd
 
 
 @dataclass(frozen=True, slots=True)

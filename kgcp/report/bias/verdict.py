@@ -10,13 +10,14 @@ from statistics import median
 
 from kgcp.quality.bias_causes import Term
 from kgcp.quality.number_text import counted, rounded
-from kgcp.report.bias.numbers import BiasNumbers, RangeRow
+from kgcp.report.bias.numbers import BIASED_SIGMAS, BiasNumbers, RangeRow
 from kgcp.report.bias.reexposure import GAINS, Reexposed
 from kgcp.report.bias.wording import (
     LABELS,
     effect_of_reference,
     exposure_sentence,
     meaning_of,
+    sd_by_reference,
     signed_amount,
     value_of,
 )
@@ -42,8 +43,9 @@ class Limits:
     min_frames: int = 10  # compared frames that the grade "good" requires
     unusable_rms_percent: float = 1.0  # of the errors; the paper has 1 % up to 100 m
     mean_percent: float = 0.02  # of a mean error that neither noise nor the reference explains
-    scale_percent: float = 0.02  # of a significant scale
-    offset_m: float = 0.01  # of a significant offset
+    # of a significant scale and offset that the reference does not explain
+    scale_percent: float = 0.02
+    offset_m: float = 0.01
     exposure_share: float = 0.1  # of the variance that exposure explains, if a term is significant
     reexposure_percent: float = 0.1  # RMS change of distances measured again, darker and brighter
     standardised_low: float = 0.5  # scatter of the fit's residuals over their reported sds
@@ -149,14 +151,17 @@ def _causes(numbers: BiasNumbers) -> Iterator[Finding]:
         yield Finding(FlightGrade.LOOK, text, "causes")
         return
     basic = [term for term in regression.terms if term.name in {"scale", "offset_m"}]
-    if not any(term.is_significant for term in basic):
+    found = [term for term in basic if _is_beyond_reference(term, numbers)]
+    if not found:
         values = " and ".join(
             f"{LABELS[term.name]} {value_of(term)}{_possible(term, numbers)}" for term in basic
         )
-        yield Finding(FlightGrade.GOOD, f"Not significant: {values}.", "causes")
+        is_explained = any(term.is_significant for term in basic)
+        what = "Errors of the reference may explain" if is_explained else "Not significant:"
+        yield Finding(FlightGrade.GOOD, f"{what} {values}.", "causes")
     large = {"scale": 0.01 * LIMITS.scale_percent, "offset_m": LIMITS.offset_m}
     for term in regression.terms:
-        if term.name in large and term.is_significant:
+        if term in found:
             material = abs(term.value) >= large[term.name]
             text = meaning_of(term)
             possible = effect_of_reference(term, numbers)
@@ -173,6 +178,16 @@ def _causes(numbers: BiasNumbers) -> Iterator[Finding]:
         exposure_sentence(regression),
         "exposure",
     )
+
+
+def _is_beyond_reference(term: Term, numbers: BiasNumbers) -> bool:
+    """Whether neither noise nor errors of the reference explain a term.
+
+    Errors of a trajectory that last as long as the flight look like an offset, and leave no scatter
+    by which the regression could tell.
+    """
+    sd = math.hypot(term.sd, sd_by_reference(term, numbers) or 0.0)
+    return term.is_significant and abs(term.value) > BIASED_SIGMAS * sd
 
 
 def _possible(term: Term, numbers: BiasNumbers) -> str:

@@ -39,13 +39,19 @@ def value_of(term: Term) -> str:
     return signed_amount(term.value, term.sd, f"px per {_PER[term.name]}")
 
 
-def effect_of_reference(term: Term, numbers: BiasNumbers) -> str | None:
+def sd_by_reference(term: Term, numbers: BiasNumbers) -> float | None:
     """Return the size of a term that errors of the reference can cause; None: not known."""
     if term.name == "scale" and numbers.total.sd_reference_percent is not None:
-        return f"± {rounded(numbers.total.sd_reference_percent)} %"
-    if term.name == "offset_m" and numbers.sd_reference_m is not None:
-        return f"± {rounded(1000.0 * numbers.sd_reference_m)} mm"
-    return None
+        return 0.01 * numbers.total.sd_reference_percent
+    return numbers.sd_reference_m if term.name == "offset_m" else None
+
+
+def effect_of_reference(term: Term, numbers: BiasNumbers) -> str | None:
+    """Return `sd_by_reference` as text."""
+    sd = sd_by_reference(term, numbers)
+    if sd is None:
+        return None
+    return f"± {rounded(100.0 * sd)} %" if term.name == "scale" else f"± {rounded(1000.0 * sd)} mm"
 
 
 def meaning_of(term: Term) -> str:

@@ -103,8 +103,18 @@ def test_focal_length_and_lever_arm_are_named(fly: Fly) -> None:
 
 
 def test_what_is_significant_but_small_does_not_spoil_a_flight(fly: Fly) -> None:
-    numbers = fly(lambda d: np.full_like(d, 0.004), sd_m=0.001, noise_m=0.001)
+    numbers = fly(lambda d: np.full_like(d, 0.004), sd_m=0.0001, noise_m=0.001)
     assert "lever arm" in texts(numbers, FlightGrade.GOOD)
+    assert assess(numbers).grade is FlightGrade.GOOD
+
+
+def test_what_the_reference_can_cause_is_no_finding(fly: Fly) -> None:
+    """An offset of 20 mm, far beyond the noise of 1 mm, by a reference that is known to 20 mm."""
+    numbers = fly(lambda d: np.full_like(d, 0.02), sd_m=0.02, noise_m=0.001)
+    assert numbers.regression is not None
+    assert any(term.is_significant for term in numbers.regression.terms)
+    text = texts(numbers, FlightGrade.GOOD)
+    assert "Errors of the reference may explain scale" in text
     assert assess(numbers).grade is FlightGrade.GOOD
 
 
