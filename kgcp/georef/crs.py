@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Self
 
 import numpy as np
 from pyproj import CRS, Transformer
@@ -13,7 +14,7 @@ from pyproj.crs import GeographicCRS
 from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
-from kgcp.errors import KgcpError
+from kgcp.errors import KgcpError, KgcpWarning
 from kgcp.geometry.arrays import FloatArray
 
 CRS_KEY = "flight.toml: crs"
@@ -22,6 +23,8 @@ WGS84_3D = "EPSG:4979"
 """Longitude, latitude and ellipsoidal height of WGS 84."""
 MAX_HEIGHT = 1e5
 """Largest credible height [m or ft], beyond any vehicle or aircraft."""
+_MAX_INACCURACY_M = 0.1  # of an operation by PROJ's database, without a warning
+_SAME_PLACE_DEG = 1e-7  # 1 cm
 _YEAR_S = 365.2425 * 86400.0
 _EARLIEST_S = 10.0 * _YEAR_S  # 1980, before GPS; times that count from a flight's start are earlier
 
@@ -112,38 +115,98 @@ def best_transformer(
     raise unknown
 
 
-def transformation_year(
-    transformer: Transformer, point: FloatArray, time_s: float | None, where: str
-) -> float | None:
-    """Return the date at which to transform, as a year; None: the operation needs none.
+@dataclass(frozen=True, slots=True, eq=False)
+class DatumTransform:
+    """The best operation from one CRS to another, at the date of the coordinates."""
 
-    Global frames such as ITRF and those that move with a continent (ETRS89, NAD83, GDA2020) drift
-    apart by centimetres a year. Without a date, PROJ silently takes the epoch of its parameters and
-    is decimetres off.
+    _transformer: Transformer
+    _year: float | None  # None: the date does not matter
 
-    Parameters
-    ----------
-    point : (3,) array
-        A place of the coordinates, in the operation's source.
-    time_s : float or None
-        When they were measured, Unix UTC [s]; None: not known.
-    where : str
-        Beginning of the message: which transformation it is.
+    @classmethod
+    def between(
+        cls,
+        source: str,
+        target: str,
+        point: FloatArray,
+        *,
+        where: str,
+        remedy: str,
+        time_s: float | None,
+        keys: tuple[str, str] = (CRS_KEY, CRS_KEY),
+    ) -> Self:
+        """Prepare the operation between two CRS, anything that pyproj reads.
 
-    Raises
-    ------
-    KgcpError
-        If the operation depends on a date that is not known.
-    """
-    one, other = (transform_points(transformer, point[None], year) for year in (2000.0, 2020.0))
-    if np.array_equal(one, other, equal_nan=True):
-        return None
-    if time_s is None or time_s < _EARLIEST_S:
-        raise KgcpError(
-            f"{where} depends on the date, because frames of reference drift apart, and the date is"
-            " not known; transform the coordinates beforehand"
-        )
-    return 1970.0 + time_s / _YEAR_S
+        Global frames such as ITRF and those that move with a continent (ETRS89, NAD83, GDA2020)
+        drift apart by centimetres a year. Without a date, PROJ silently takes the epoch of its
+        parameters and is decimetres off.
+
+        The best operation may be good to metres. This causes a `KgcpWarning`, unless it leaves
+        longitude and latitude as they are: WGS 84 counts as equal to ETRS89 and the like.
+
+        Parameters
+        ----------
+        point : (3,) array
+            A place of the coordinates, in the source.
+        where, remedy : str
+            Beginning and end of messages: which transformation it is, and what to do if it is good
+            to metres only.
+        time_s : float or None
+            When the coordinates were measured, Unix UTC [s]; None: not known.
+        keys : (str, str)
+            Where source and target were given, for messages.
+
+        Raises
+        ------
+        KgcpError
+            As `best_transformer`, or if the operation depends on a date that is not known.
+        """
+        crs = parse_crs(source, keys[0]), parse_crs(target, keys[1])
+        transformer = best_transformer(*crs, where)
+        early, late = (cls(transformer, year).positions(point[None]) for year in (2000.0, 2020.0))
+        year = None
+        if not np.array_equal(early, late, equal_nan=True):
+            if time_s is None or time_s < _EARLIEST_S:
+                raise KgcpError(
+                    f"{where} depends on the date, because frames of reference drift apart, and the"
+                    " date is not known; transform the coordinates beforehand"
+                )
+            year = 1970.0 + time_s / _YEAR_S
+        prepared = cls(transformer, year)
+        inaccuracy_m = prepared._inaccuracy_m(source, target, point)
+        if inaccuracy_m > _MAX_INACCURACY_M:
+            warnings.warn(
+                f"{where} is good to {inaccuracy_m:g} m only, by PROJ's database; {remedy}",
+                KgcpWarning,
+                stacklevel=3,
+            )
+        return prepared
+
+    def positions(self, points: FloatArray, *, errcheck: bool = False) -> FloatArray:
+        """Transform points (n, 3).
+
+        Raises
+        ------
+        ProjError
+            With `errcheck`, if a point cannot be transformed; without it, such points are infinite.
+        """
+        x, y, z = points.T
+        if self._year is None:
+            return np.column_stack(self._transformer.transform(x, y, z, errcheck=errcheck))
+        years = np.full(len(points), self._year)
+        columns = self._transformer.transform(x, y, z, years, errcheck=errcheck)
+        return np.column_stack(columns[:3])
+
+    def _inaccuracy_m(self, source: str, target: str, point: FloatArray) -> float:
+        """Return how inexact the operation is at a place [m]; 0: exact, null, or not known."""
+        moved = self.positions(point[None])[0]
+        try:
+            operation = self._transformer.get_last_used_operation()
+        except ProjError:  # it does nothing, or cannot be used there
+            return 0.0
+        shift_deg = _geographic_place(target, moved) - _geographic_place(source, point)
+        is_on_earth = abs(moved[2]) < MAX_HEIGHT  # else a refusal follows
+        is_shift = is_on_earth and bool(np.any(np.abs(shift_deg) > _SAME_PLACE_DEG))
+        return max(0.0, float(operation.accuracy or 0.0)) if is_shift else 0.0
 
 
 def convert_positions(
@@ -159,14 +222,20 @@ def convert_positions(
     Raises
     ------
     KgcpError
-        As `best_transformer` and `transformation_year`, or if a point is outside the operation's
-        domain or higher than `MAX_HEIGHT`.
+        As `DatumTransform.between`, or if a point is outside the operation's domain or higher than
+        `MAX_HEIGHT`.
     """
-    where = f"{file}: the transformation from {source!r} to the flight's crs {target!r}"
-    transformer = best_transformer(parse_crs(source, VEHICLE_CRS), parse_crs(target), where)
-    converted = transform_points(
-        transformer, position, transformation_year(transformer, position[0], time_s, where)
+    transform = DatumTransform.between(
+        source,
+        target,
+        position[0],
+        where=f"{file}: the transformation from {source!r} to the flight's crs {target!r}",
+        remedy="name the base station's datum, such as ETRS89 (EPSG:4937), as [vehicle] crs if it"
+        " leads there more exactly",
+        time_s=time_s,
+        keys=(VEHICLE_CRS, CRS_KEY),
     )
+    converted = transform.positions(position)
     is_valid = np.isfinite(converted).all(axis=1)
     if not parse_crs(target).is_geocentric:
         is_valid &= np.abs(converted[:, 2]) < MAX_HEIGHT
@@ -180,37 +249,22 @@ def convert_positions(
     return converted
 
 
-def transform_points(
-    transformer: Transformer, points: FloatArray, year: float | None, *, errcheck: bool = False
-) -> FloatArray:
-    """Transform points (n, 3) at a date of `transformation_year`.
-
-    Raises
-    ------
-    ProjError
-        With `errcheck`, if a point cannot be transformed; without it, such points are infinite.
-    """
-    x, y, z = points.T
-    if year is None:
-        return np.column_stack(transformer.transform(x, y, z, errcheck=errcheck))
-    years = np.full(len(points), year)
-    return np.column_stack(transformer.transform(x, y, z, years, errcheck=errcheck)[:3])
-
-
 def wgs84_from_map(crs: str, positions: Sequence[FloatArray], where: str) -> FloatArray:
     """Return longitude, latitude [deg] and ellipsoidal height [m] (n, 3) of map points (n, 3).
 
     Raises
     ------
     KgcpError
-        As `best_transformer`, or if the operation depends on a date; `where` is the format's name.
+        As `DatumTransform.between`, without a date; `where` is the format's name.
     """
     if not positions:
         return np.empty((0, 3))
     where = f"{where}: the transformation from {crs!r} to WGS 84"
-    to_wgs84 = best_transformer(parse_crs(crs), parse_crs(WGS84_3D), where)
-    year = transformation_year(to_wgs84, positions[0], None, where)
-    return transform_points(to_wgs84, np.array(positions), year, errcheck=True)
+    remedy = "if points must be better, use a format that takes the flight's crs"
+    to_wgs84 = DatumTransform.between(
+        crs, WGS84_3D, positions[0], where=where, remedy=remedy, time_s=None
+    )
+    return to_wgs84.positions(np.array(positions), errcheck=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,6 +339,16 @@ def longitude_latitude(crs: str, xy: FloatArray) -> FloatArray:
     columns = np.column_stack(transformer.transform(x, y))
     columns[~np.isfinite(columns).all(axis=1)] = np.nan
     return columns
+
+
+def _geographic_place(crs: str, point: FloatArray) -> FloatArray:
+    """Return longitude and latitude (2,) in the CRS's datum of a point (3,) [deg]."""
+    parsed = parse_crs(crs)
+    if not parsed.is_geocentric:
+        return np.asarray(longitude_latitude(crs, point[None, :2])[0])
+    geographic = CRS.from_user_input(geographic_of(parsed))
+    to_geographic = Transformer.from_crs(parsed, geographic, always_xy=True)
+    return np.array(to_geographic.transform(*point)[:2], dtype=np.float64)
 
 
 @lru_cache(maxsize=8)

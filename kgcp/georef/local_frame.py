@@ -21,12 +21,11 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.crs import (
     CRS_KEY,
     VEHICLE_CRS,
+    DatumTransform,
     best_transformer,
     geographic_of,
     is_geographic,
     parse_crs,
-    transform_points,
-    transformation_year,
     unusable,
 )
 
@@ -257,8 +256,7 @@ class CrsTransform:
 
     source: LocalFrame  # of the flight's CRS
     target: LocalFrame  # of the other CRS
-    _between: Transformer
-    _year: float | None  # the date of the coordinates, if it matters
+    _between: DatumTransform
     _where: str
 
     @classmethod
@@ -288,18 +286,24 @@ class CrsTransform:
             If the CRS is unknown or unusable, if no exact operation leads to it, or if that
             operation needs a grid that is not installed, or a date that is not known.
         """
-        way = f"{where} {crs!r}: the transformation from {source.crs!r}"
-        between = best_transformer(parse_crs(source.crs), parse_crs(crs, where), way)
-        year = transformation_year(between, near_map, time_s, way)
-        draft = cls(source, source, between, year, where)
+        between = DatumTransform.between(
+            source.crs,
+            crs,
+            near_map,
+            where=f"{where} {crs!r}: the transformation from {source.crs!r}",
+            remedy="give a CRS to which a better one is known, if the coordinates must be better",
+            time_s=time_s,
+            keys=(CRS_KEY, where),
+        )
+        draft = cls(source, source, between, where)
         target = LocalFrame.at(crs, draft.positions(np.reshape(near_map, (1, 3)))[0], where)
-        return cls(source, target, between, year, where)
+        return cls(source, target, between, where)
 
     def positions(self, xyz: FloatArray) -> FloatArray:
         """Transform points (n, 3) of the source map into the other one (n, 3)."""
         points = np.asarray(xyz, dtype=np.float64)
         try:
-            return transform_points(self._between, points, self._year, errcheck=True)
+            return self._between.positions(points, errcheck=True)
         except ProjError as error:
             text = " ".join(str(error).split())
             raise KgcpError(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kgcp.errors import KgcpError
+from kgcp.errors import KgcpError, KgcpWarning
 from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.crs import best_transformer, convert_positions, parse_crs, wgs84_from_map
 from kgcp.georef.gcp import Gcp, transform_gcps
@@ -198,6 +198,18 @@ def test_frames_that_drift_apart_need_a_date(time_s: float | None) -> None:
 def test_wgs84_is_not_reached_without_a_date_where_it_matters() -> None:
     with pytest.raises(KgcpError, match=r"^geojson: .* depends on the date"):
         wgs84_from_map("EPSG:7910", [_CANBERRA], "geojson")  # ITRF2005
+
+
+def test_a_datum_that_is_reached_to_a_metre_is_told() -> None:
+    place = np.array([5.387, 52.155, 50.0])  # Amersfoort, whose grid leads from ETRS89
+    with pytest.warns(KgcpWarning, match=r"^t\.csv: .* is good to 1 m only, .* \[vehicle\] crs"):
+        convert_positions("t.csv", place[None], "EPSG:4979", "EPSG:28992", _IN_2026_S)
+    # WGS 84 counts as equal to ETRS89, also in Earth-centred coordinates
+    convert_positions("t.csv", place[None], "EPSG:4979", "EPSG:25832", _IN_2026_S)
+    ecef = np.array([3903453.1, 368135.3, 5012970.3])
+    convert_positions("t.csv", ecef[None], "EPSG:4978", "EPSG:25832", _IN_2026_S)
+    # Swiss coordinates are defined by a shift from ETRS89
+    convert_positions("t.csv", np.array([[7.4, 46.9, 500.0]]), "EPSG:4937", "EPSG:2056", 0.0)
 
 
 def test_operations_none_of_which_is_usable_are_an_error() -> None:

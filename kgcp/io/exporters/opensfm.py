@@ -8,7 +8,7 @@ of the frame, with (0, 0) px in the centre of the top-left pixel.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -50,17 +50,22 @@ def files(points: MapPoints) -> Mapping[str, str]:
     KgcpError
         If the CRS has no known way to WGS 84, or two images have the same name.
     """
-    texts = {"ground_control_points.json": _control(points), "HOWTO.txt": _HOWTO}
+    places = [group[0].position_map for group in by_id(points.controls).values()]
+    cameras = [prior.position_map for prior in points.priors]
+    geodetic = wgs84_from_map(points.crs, [*places, *cameras], _FOLDER).tolist()
+    texts = {
+        "ground_control_points.json": _control(points, geodetic[: len(places)]),
+        "HOWTO.txt": _HOWTO,
+    }
     if points.priors:
-        texts["exif_overrides.json"] = _overrides(points)
+        texts["exif_overrides.json"] = _overrides(points, geodetic[len(places) :])
     return {f"{_FOLDER}/{name}": text for name, text in texts.items()}
 
 
-def _control(points: MapPoints) -> str:
+def _control(points: MapPoints, geodetic: Sequence[Sequence[float]]) -> str:
+    """Return the points; `geodetic` is longitude, latitude [deg] and height [m] of each."""
     names = image_names((point.frame for point in points.gcps), _FOLDER, "")
     groups = by_id(points.controls)
-    heads = [group[0] for group in groups.values()]
-    geodetic = wgs84_from_map(points.crs, [point.position_map for point in heads], _FOLDER)
     entries = [
         {
             "id": point_id,
@@ -70,9 +75,7 @@ def _control(points: MapPoints) -> str:
                 for point in group
             ],
         }
-        for (point_id, group), (lon, lat, height) in zip(
-            groups.items(), geodetic.tolist(), strict=True
-        )
+        for (point_id, group), (lon, lat, height) in zip(groups.items(), geodetic, strict=True)
     ]
     return json.dumps({"points": entries}, indent=1, ensure_ascii=False) + "\n"
 
@@ -85,11 +88,11 @@ def _normalised(point: Gcp, camera: Camera) -> list[float]:
     return projection
 
 
-def _overrides(points: MapPoints) -> str:
+def _overrides(points: MapPoints, geodetic: Sequence[Sequence[float]]) -> str:
+    """Return the priors' positions; `geodetic` as in `_control`."""
     names = image_names((prior.frame for prior in points.priors), _FOLDER, "")
-    geodetic = wgs84_from_map(points.crs, [prior.position_map for prior in points.priors], _FOLDER)
     entries = {}
-    for prior, (lon, lat, height) in zip(points.priors, geodetic.tolist(), strict=True):
+    for prior, (lon, lat, height) in zip(points.priors, geodetic, strict=True):
         gps = {"latitude": lat, "longitude": lon, "altitude": height}
         if prior.cov is not None:
             gps["dop"] = largest_sd(prior.cov[:3, :3])
