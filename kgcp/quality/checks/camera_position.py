@@ -9,7 +9,7 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
 from kgcp.quality.checks.frame_header import FrameHeader
-from kgcp.quality.checks.place import place_text
+from kgcp.quality.checks.place import median_place, place_text, wrapped_deg
 
 _EARTH_M = 6.37e6
 _MAX_DISTANCE_M = 2000.0  # between a drone and the vehicle below it
@@ -37,9 +37,9 @@ def check_camera_position(
     ).reshape(-1, 2)
     if not len(camera) or not len(ground_lonlat):
         return
-    place = np.median(camera, axis=0)
-    ground = np.median(ground_lonlat, axis=0)
-    extent_m = float(np.linalg.norm(_metres(np.ptp(ground_lonlat, axis=0), ground)))
+    place, ground = median_place(camera), median_place(ground_lonlat)
+    extent_deg = np.ptp(wrapped_deg(ground_lonlat - ground), axis=0)
+    extent_m = float(np.linalg.norm(_metres(extent_deg, ground)))
     off_m = float(np.linalg.norm(_metres(place - ground, ground)))
     if off_m <= _MAX_DISTANCE_M + extent_m:
         return
@@ -100,6 +100,5 @@ def check_altitude(altitude_m: FloatArray, height_above_m: FloatArray) -> Iterat
 def _metres(difference_deg: FloatArray, at_deg: FloatArray) -> FloatArray:
     """Return differences of longitude and latitude (2,) in metres east and north."""
     shrink = np.array([np.cos(np.radians(at_deg[1])), 1.0])
-    wrapped = (difference_deg + 180.0) % 360.0 - 180.0
-    metres: FloatArray = np.radians(wrapped) * shrink * _EARTH_M
+    metres: FloatArray = np.radians(wrapped_deg(difference_deg)) * shrink * _EARTH_M
     return metres

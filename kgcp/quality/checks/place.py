@@ -29,8 +29,8 @@ def check_place(crs: str, position_map: FloatArray, where: str) -> Iterator[Doub
         Subject of the sentence: "the trajectory".
     """
     area = area_of_use(crs)
-    xy = np.median(position_map[:, :2], axis=0)
     is_angular = is_geographic(crs)
+    xy = (median_place if is_angular else _median)(position_map[:, :2])
     outside = _outside(area, crs, xy)
     may_be_radians = is_angular and bool(np.all(np.abs(xy) <= _MAX_RAD))
     if outside <= _MAX_OUTSIDE_DEG and not may_be_radians:
@@ -48,6 +48,22 @@ def check_place(crs: str, position_map: FloatArray, where: str) -> Iterator[Doub
     else:
         code, words, remedy = guess
         yield grave(code, f"{sentence}: {words}", remedy, figures)
+
+
+def median_place(lonlat_deg: FloatArray) -> FloatArray:
+    """Return the median (2,) of places (n, 2), longitude first, also across the antimeridian."""
+    first = lonlat_deg[0]
+    return np.asarray(first + _median(wrapped_deg(lonlat_deg - first)))
+
+
+def wrapped_deg(difference_deg: FloatArray) -> FloatArray:
+    """Return differences of longitude and latitude (..., 2), by the shorter way round."""
+    longitude, latitude = np.moveaxis(difference_deg, -1, 0)
+    return np.stack((longitude - 360.0 * np.round(longitude / 360.0), latitude), axis=-1)
+
+
+def _median(xy: FloatArray) -> FloatArray:
+    return np.asarray(np.median(xy, axis=0))
 
 
 def place_text(crs: str, longitude_deg: float, latitude_deg: float) -> str:

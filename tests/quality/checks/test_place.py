@@ -94,6 +94,14 @@ def test_gps_positions_near_the_trajectory_raise_no_doubt() -> None:
     assert not [*check_camera_position([FrameHeader("a.jpg")], "EPSG:25832", GROUND, "x")]
 
 
+def test_a_flight_across_the_antimeridian_raises_no_doubt() -> None:
+    longitudes = (179.9996, 179.9998, -179.9998, -179.9996)
+    headers = [header(longitude, -42.0) for longitude in longitudes]
+    ground = np.array([[longitude, -42.0, 9.0] for longitude in longitudes])
+    assert not [*check_camera_position(headers, "EPSG:4167", ground[:, :2], "the trajectory")]
+    assert not [*check_place("EPSG:4167", ground, "the trajectory")]  # New Zealand's own
+
+
 @pytest.mark.parametrize(
     ("ground", "code", "words"),
     [
