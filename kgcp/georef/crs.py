@@ -10,6 +10,7 @@ from typing import Self
 
 import numpy as np
 from pyproj import CRS, Transformer
+from pyproj.aoi import AreaOfInterest
 from pyproj.crs import GeographicCRS
 from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
@@ -77,6 +78,7 @@ def best_transformer(
     target: CRS,
     where: str,
     remedy: str = "give a CRS of the flight's datum and heights",
+    area: AreaOfInterest | None = None,
 ) -> Transformer:
     """Return the best operation between two CRS; x is easting or longitude in both.
 
@@ -88,6 +90,9 @@ def best_transformer(
     ----------
     where, remedy : str
         Beginning and end of messages: which transformation it is, and what to give instead.
+    area : AreaOfInterest, optional
+        Where the coordinates are. Without it, PROJ takes operations for best that are meant for
+        another country, and asks for that country's grids.
 
     Raises
     ------
@@ -98,12 +103,25 @@ def best_transformer(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a missing grid is an error below
         try:
-            operations = TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
+            operations = TransformerGroup(
+                source,
+                target,
+                always_xy=True,
+                allow_ballpark=False,
+                area_of_interest=area,  # type: ignore[arg-type]  # the stubs name another class
+            )
         except IndexError:  # pyproj's, if PROJ knows operations and can use none of them
             raise unknown from None
+    if area is not None and not operations.transformers + operations.unavailable_operations:
+        return best_transformer(source, target, where, remedy)  # a CRS used beside its area
     if operations.best_available and operations.transformers:
         return Transformer.from_crs(
-            source, target, always_xy=True, only_best=True, allow_ballpark=False
+            source,
+            target,
+            always_xy=True,
+            only_best=True,
+            allow_ballpark=False,
+            area_of_interest=area,  # type: ignore[arg-type]  # as above
         )
     grids = [grid for best in operations.unavailable_operations[:1] for grid in best.grids]
     missing = sorted({grid.short_name for grid in grids if not grid.available})
@@ -161,7 +179,7 @@ class DatumTransform:
             As `best_transformer`, or if the operation depends on a date that is not known.
         """
         crs = parse_crs(source, keys[0]), parse_crs(target, keys[1])
-        transformer = best_transformer(*crs, where)
+        transformer = best_transformer(*crs, where, area=_area_about(source, point))
         early, late = (cls(transformer, year).positions(point[None]) for year in (2000.0, 2020.0))
         year = None
         if not np.array_equal(early, late, equal_nan=True):
@@ -325,18 +343,19 @@ def is_geographic(crs: str) -> bool:
 def longitude_latitude(crs: str, xy: FloatArray) -> FloatArray:
     """Return longitude and latitude (n, 2) in the CRS's datum of map points (n, 2) [deg].
 
-    NaN for points outside the map's domain.
+    Longitudes count from Greenwich. NaN for points outside the map's domain.
 
     Raises
     ------
     KgcpError
         If pyproj cannot read the CRS.
     """
-    transformer = _to_longitude_latitude(crs)
+    transformer, degrees_per_unit, meridian_deg = _to_longitude_latitude(crs)
     if transformer is None:
         return np.full(xy.shape, np.nan)
     x, y = xy.T
-    columns = np.column_stack(transformer.transform(x, y))
+    columns = degrees_per_unit * np.column_stack(transformer.transform(x, y))
+    columns[:, 0] += meridian_deg
     columns[~np.isfinite(columns).all(axis=1)] = np.nan
     return columns
 
@@ -351,14 +370,32 @@ def _geographic_place(crs: str, point: FloatArray) -> FloatArray:
     return np.array(to_geographic.transform(*point)[:2], dtype=np.float64)
 
 
+def _area_about(crs: str, point: FloatArray) -> AreaOfInterest | None:
+    """Return the place of a point (3,) as an area; None: it is nowhere on Earth."""
+    longitude, latitude = _geographic_place(crs, point).tolist()
+    if not np.isfinite(longitude) or not abs(latitude) <= 90.0:
+        return None
+    longitude = (longitude + 180.0) % 360.0 - 180.0
+    return AreaOfInterest(longitude, latitude, longitude, latitude)
+
+
 @lru_cache(maxsize=8)
-def _to_longitude_latitude(crs: str) -> Transformer | None:
+def _to_longitude_latitude(crs: str) -> tuple[Transformer | None, float, float]:
+    """Return the way to the geographic CRS, the degrees of its unit, and its prime meridian."""
     parsed = parse_crs(crs)
     horizontal = parsed.sub_crs_list[0] if parsed.is_compound else parsed.to_2d()
     geodetic = horizontal.geodetic_crs
     if geodetic is None:
-        return None
-    return Transformer.from_crs(horizontal, geodetic.to_2d(), always_xy=True)
+        return None, 1.0, 0.0
+    meridian = geodetic.prime_meridian
+    meridian_rad = 0.0
+    if meridian is not None:
+        meridian_rad = meridian.longitude * float(meridian.unit_conversion_factor)
+    return (
+        Transformer.from_crs(horizontal, geodetic.to_2d(), always_xy=True),
+        float(np.degrees(geodetic.axis_info[0].unit_conversion_factor)),
+        float(np.degrees(meridian_rad)),
+    )
 
 
 @lru_cache(maxsize=8)

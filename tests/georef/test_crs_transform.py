@@ -179,6 +179,14 @@ def test_a_continent_drifts_until_the_day_of_the_trajectory() -> None:
     assert metres[1] == pytest.approx(-north_m, abs=2e-3)
 
 
+def test_operations_are_those_of_the_place() -> None:
+    """EPSG:25832 is also Norway's, whose grids PROJ would take for best anywhere in Europe."""
+    munich = np.array([[11.5, 48.1, 500.0]])
+    fixed = convert_positions("t.csv", munich, "EPSG:9989", "EPSG:25832", _IN_2026_S)[0]
+    drift = fixed - convert_positions("t.csv", munich, "EPSG:4937", "EPSG:25832", _IN_2026_S)[0]
+    assert np.linalg.norm(drift) == pytest.approx(37.5 * 0.025, abs=0.15)  # years of 2.5 cm
+
+
 def test_points_on_another_map_are_those_of_their_day() -> None:
     source = LocalFrame.at("EPSG:7843", _CANBERRA)
     transform = CrsTransform.to("EPSG:7912", source, _CANBERRA, time_s=_IN_2026_S)

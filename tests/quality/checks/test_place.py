@@ -24,6 +24,7 @@ PLACES = [
     ("EPSG:2264", 1450000.0, 540000.0),  # North Carolina, US survey feet
     ("EPSG:32760", 300000.0, 5100000.0),  # New Zealand, near the antimeridian
     ("EPSG:3857", 1285600.0, 6133000.0),
+    ("EPSG:27571", 600000.0, 1330000.0),  # France's north, whose longitudes are grads from Paris
     ("+proj=utm +zone=32 +ellps=GRS80", 689586.0, 5336252.0),
 ]
 
