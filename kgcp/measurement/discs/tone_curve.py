@@ -83,8 +83,8 @@ def steep_enough(waves: FloatArray) -> FloatArray:
     """Return the amplitudes (3,), reduced until the curve is steep enough everywhere.
 
     Where a curve is flat, a gradient of the light does not show on the ground, however large it is.
-    The gradient would then explain whatever makes opposite edges differ: coma, or the order of the
-    rows.
+    The fit would then use such a gradient to explain anything that makes opposite edges differ, for
+    example coma.
     """
     steepest_fall = -float((waves @ _slopes_of_waves()).min())
     most = 1.0 - _LEAST_SLOPE

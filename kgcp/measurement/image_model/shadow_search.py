@@ -45,8 +45,8 @@ _TINY_LEVEL = 1e-6  # of full scale
 # of 5 px seemed to brighten ink by 0.14 of what it took from the plate.
 _MIN_INK_RATIO, _MAX_INK_RATIO = -0.2, 0.6
 _BURNT_MARGIN = 0.02  # relative to the contrast; white so close to the limit may be burnt
-# Largest level of sunlit ink relative to that of the plate, in linear light. It is 0.05 to 0.11
-# where white is burnt. Under a highlight ink is brighter, in one case by 0.15.
+# Largest level of sunlit ink relative to that of the plate, in linear light. Where the sun burnt
+# the white, this ratio was 0.05 to 0.11. Under a highlight, ink is brighter.
 _MAX_INK = 0.13
 
 

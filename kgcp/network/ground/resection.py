@@ -44,9 +44,9 @@ _MAX_ROUNDS = 10
 _SAME_RAD, _SAME_SHIFT = 2e-3, 2e-3
 # Errors of a hypothesis from three noisy points: in the image, and relative in distances.
 _START_PX, _START_DISTANCE = 2.0, 0.01
-# With a redundancy of at most 2, the sum of all χ² must not exceed the limit of this probability.
-# Four points without distances have a redundancy of 2. In 1 of 1800 frames, a wrong name passed the
-# limit of single points.
+# If the redundancy is at most 2, as of four points without distances, the sum of the χ² of all
+# points must not exceed the value that chance exceeds with this probability. With the limit of
+# single points alone, a wrong name among four points went unnoticed in 1 of 1800 frames.
 _LOW_REDUNDANCY, _LOW_REDUNDANCY_CHANCE = 2, 0.01
 # Standard deviations of the rotation about its weakest axis [rad]. Above the first one, likely
 # poses lie on a noticeably curved line, and second-order terms are added to the covariance. Above

@@ -28,8 +28,8 @@ _MAX_SIZE_RATIO = 2.2
 _MAX_AXIS_RATIO = 1.6  # of a disc in the affine frame of its neighbour
 _MAX_SEEDS = 24
 _MIN_DISCS = 6
-# A hole with a smaller half of its shorter axis may look filled. All holes of 1.35 px were detected
-# and none of 0.9 px.
+# A hole whose smaller semi-axis is less than this may look filled. In trials, all holes with a
+# semi-axis of 1.35 px were seen, and none with 0.9 px.
 _MIN_HOLE_PX = 1.2
 _MAX_OUTSIDE = 0.12  # share of a lattice's discs that may lie outside the field
 
