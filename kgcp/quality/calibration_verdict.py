@@ -42,7 +42,7 @@ class CalibrationGrade(StrEnum):
     """What a calibration may be used for."""
 
     GOOD = "good"
-    LOOK = "to be looked at"
+    LOOK = "to be checked"
     UNUSABLE = "unusable"
 
 

@@ -536,7 +536,7 @@ def test_a_fisheye_is_told() -> None:
     assert "fisheye" in verdict.sentence
 
 
-def test_negatives_are_to_be_looked_at() -> None:
+def test_negatives_are_to_be_checked() -> None:
     result = calibrated(views(), lens=LensModel.AUTO)
     verdict = judge(result, calibration_numbers(result, DiscLight(0.07, 0.01, 0.0)))
     assert verdict.grade is CalibrationGrade.LOOK
