@@ -113,7 +113,7 @@ class Reason(StrEnum):
     NO_CANDIDATE = (
         "no_candidate",
         Status.NOT_FOUND,
-        "nothing like the target, apart from rings of other targets",
+        "the frame shows nothing like the target, apart from rings of other targets",
         "none needed if the target is not in the frame; else see the contact sheet",
     )
     CODE_MISMATCH = (
@@ -131,19 +131,19 @@ class Reason(StrEnum):
     NO_PREDICTION = (
         "no_prediction",
         Status.NOT_FOUND,
-        "nothing predicts where a plain target is in this frame, or not well enough",
+        "nothing predicts well enough where a plain target is in this frame",
         "give [reference] poses of the frames (see kgcp orient), marks or more static targets",
     )
     UNLIKE_PREDICTION = (
         "unlike_prediction",
         Status.NOT_FOUND,
-        "the edge where a plain target must be has another place, size or shape",
+        "the edge near the predicted place of a plain target has another place, size or shape",
         "none needed if it is hidden; else correct its diameter, position or normal",
     )
     AMBIGUOUS_PLACE = (
         "ambiguous_place",
         Status.REJECTED,
-        "two things that look like a plain target are where it must be",
+        "two things that look like a plain target are where it is predicted",
         "give better poses, or keep the ground clear",
     )
     CROWDED = (
@@ -161,13 +161,13 @@ class Reason(StrEnum):
     OTHER_CODE = (
         "other_code",
         Status.REJECTED,
-        "a ring of this target's geometry, but with dots that are not this code's",
+        "a ring of this target's geometry, but with the dots of another code",
         "correct code_deg in flight.toml, or clean the dots",
     )
     TOO_SMALL = (
         "too_small",
         Status.REJECTED,
-        "a ring like this target's, but with less than the smallest radius across",
+        "a ring like this target's, but its radius is below the smallest allowed",
         "fly lower, use a larger target or search for smaller rings",
     )
     TOO_BLURRED = (
@@ -215,7 +215,7 @@ class Reason(StrEnum):
     NO_CONTRAST = (
         "no_contrast",
         Status.REJECTED,
-        "ink is not darker than the plate: too dark, burnt out or too blurred",
+        "ink is not darker than the plate: the image is too dark, burnt out or too blurred",
         "expose for the plate; look at the picture in the contact sheet",
     )
     POOR_FIT = (
@@ -245,7 +245,7 @@ class Reason(StrEnum):
     TIMED_OUT = (
         "timed_out",
         Status.UNREADABLE,
-        "the frame took longer than allowed, also when it was examined alone",
+        "the frame took longer than allowed, even when it was examined alone",
         "look at the file, or allow more time",
     )
 

@@ -40,7 +40,7 @@ class Cause(StrEnum):
     FOCAL_LENGTH = "focal_length", "fx and fy are in millimetres, or do not belong to the frames"
     PRINCIPAL_POINT = (
         "principal_point",
-        "cx and cy are not near the frame's centre: in millimetres, or exchanged",
+        "cx and cy are not near the frame's centre: they are in millimetres, or exchanged",
     )
     CALIBRATION_SIZE = (
         "calibration_size",
@@ -52,15 +52,18 @@ class Cause(StrEnum):
         "diameters",
         "diameters are radii, or in millimetres, inches or feet",
     )
-    LAYOUT = "layout", "the search misses rings of such proportions: inner diameter, dots"
+    LAYOUT = "layout", "the search misses rings with such an inner diameter or such dots"
     DISTANCE_SCALE = (
         "distance_scale",
-        "all distances are wrong by one factor: focal length or diameters",
+        "all distances are wrong by the same factor: focal length or diameters are wrong",
     )
     AXES_SWAPPED = "axes_swapped", "x and y, or longitude and latitude, are exchanged"
     ANGLE_UNIT = "angle_unit", "angles or geographic coordinates are in radians or gon"
     CRS = "crs", "the coordinates are not in the CRS that is named"
-    HEADING = "heading", "headings do not follow the course: another zero or sense of rotation"
+    HEADING = (
+        "heading",
+        "headings do not follow the course: they have another zero direction or sense of rotation",
+    )
     ATTITUDE = "attitude", "roll or pitch are not those of a vehicle on a road"
     TRAJECTORY_SPIKE = (
         "trajectory_spike",
@@ -68,21 +71,24 @@ class Cause(StrEnum):
     )
     STANDARD_DEVIATIONS = (
         "standard_deviations",
-        "standard deviations are 0, as of nothing measured, or seem to be in another unit",
+        "standard deviations are 0, or seem to be in another unit",
     )
     LEVER_ARM = "lever_arm", "an axis of the lever arm is wrong, or several targets share it"
     MOUNT = "mount_deg", "the plate is mounted in another direction than mount_deg says"
     HEIGHTS = "heights", "heights are of another kind: above the geoid, or above ground"
-    CLOCK = "clock", "times are of another clock: leap seconds, hours, days or GPS weeks"
-    NO_OVERLAP = "no_overlap", "frames and trajectory are not of the same time"
+    CLOCK = "clock", "times are of another clock, off by leap seconds, hours, days or GPS weeks"
+    NO_OVERLAP = "no_overlap", "the times of frames and trajectory do not overlap"
     NO_TIMES = "no_times", "frames have no time"
-    WHOLE_SECONDS = "whole_seconds", "frame times are whole seconds: too coarse, or cut"
-    SAME_TIMES = "same_times", "several frames have one time: copies, or times in whole seconds"
+    WHOLE_SECONDS = "whole_seconds", "frame times are whole seconds: too coarse, or truncated"
+    SAME_TIMES = (
+        "same_times",
+        "several frames have the same time: they are copies, or times are in whole seconds",
+    )
     FRAME_ORDER = "frame_order", "times or reference poses belong to the next or previous frame"
-    REFERENCE = "reference", "reference poses are of another place, or turned"
+    REFERENCE = "reference", "reference poses are of another place, or rotated"
     STATIC_TARGETS = (
         "static_targets",
-        "a static target is not where position_m says, by its distances to the others",
+        "a static target is not at its position_m, as its distances to the others show",
     )
     CAMERA_POSITION = (
         "camera_position",
