@@ -71,7 +71,7 @@ FIGURE_FILES = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Report:
-    """Files of a report, and its numbers and verdict."""
+    """The numbers, the verdict and the files of a report."""
 
     numbers: Json
     verdict: Verdict
@@ -84,24 +84,24 @@ class Report:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlightBias:
-    """Measured distances of a flight against its reference poses.
+    """Comparison of the measured distances of a flight with its reference poses.
 
     Attributes
     ----------
     settings : DetectSettings
         Settings with which the distances were measured.
     study : BiasStudy
-        Every comparison.
+        The comparison of every measurement.
     provenance : mapping of str
-        Origin of the comparisons: the metadata of their table.
+        Metadata of bias.parquet: what the comparisons were made from.
     doubts : tuple of Doubt
-        Doubts with their likely causes, grave ones first.
+        What does not fit, with its likely cause; grave doubts come first.
     outcomes : Outcomes or None
-        Outcomes of the frames; None: unknown.
+        Counts of the frames by outcome; None: unknown.
     consistency : Consistency or None
         Agreement of vehicle and camera; None: too few frames to compare.
     learnt : LearntImaging or None
-        What the frames say together of the camera; None: nothing was learnt.
+        Properties of the camera learnt from all frames together; None: nothing was learnt.
     """
 
     flight: Flight
@@ -114,7 +114,7 @@ class FlightBias:
     learnt: LearntImaging | None = None
 
     def summary(self) -> Json:
-        """Return the numbers of `bias_summary.json`, without re-exposed frames."""
+        """Return the numbers of `bias_summary.json`, but without those of re-exposed frames."""
         numbers = bias_numbers(self.study)
         return summary_of(numbers, assess(numbers, []), [])
 
@@ -139,7 +139,7 @@ class FlightBias:
         folder : Path, optional
             By default the flight's results folder.
         reexpose : int
-            How many frames to measure again, with darker and brighter grey values.
+            Number of frames to measure again with darker and brighter grey values.
         stored_frames : StoredFolder, optional
             Where the frames are, if not in the flight's folder.
 
@@ -153,9 +153,9 @@ class FlightBias:
         if not study.trusted:
             with naming_causes(self.doubts):
                 raise KgcpError(
-                    f"none of {len(study.measured)} measurements lies where a reference pose and"
-                    " the trajectory put the target; check [reference] poses, [vehicle] trajectory"
-                    " and crs"
+                    f"none of {len(study.measured)} measurements is where a reference pose and"
+                    " the trajectory predict the target; check [reference] poses, [vehicle]"
+                    " trajectory and crs"
                 )
         content = self._content(stored_frames or flight.frames_folder, reexpose)
         files = {FIGURE_FILES[name]: figure.png for name, figure in content.pictures.items()}
@@ -168,7 +168,7 @@ class FlightBias:
         for name, data in files.items():
             write_bytes(folder / name, data)
         for name in set(FIGURE_FILES.values()) - files.keys():
-            remove(folder / name)  # of an earlier run: not of these numbers
+            remove(folder / name)  # left by an earlier run: it does not show these numbers
         paths = (table, *(folder / name for name in files))
         return Report(content.summary, content.verdict, paths)
 
@@ -206,7 +206,7 @@ def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBi
     Parameters
     ----------
     detections : Path, optional
-        What `detect_flight` wrote; by default in the flight's results folder.
+        The table that `detect_flight` wrote; by default that of the flight's results folder.
 
     Raises
     ------
@@ -252,7 +252,7 @@ def _closeups_and_reexposures(
     closeup_rows: list[int],
     reexposed_rows: list[int],
 ) -> tuple[dict[int, tuple[bytes, tuple[FloatArray, ...]]], list[Reexposed]]:
-    """Draw close-ups of some rows and measure some again, where their frames exist."""
+    """Draw close-ups of some rows and measure some rows again, if their frames exist."""
     closeups = {}
     reexposed: list[Reexposed] = []
     targets = {target.name: target for target in flight.all_targets}
@@ -278,7 +278,7 @@ def _closeups_and_reexposures(
 
 
 def _ring_view(camera: Camera, target: AnyTarget, pose: Pose, centre_px: FloatArray) -> RingView:
-    """Return a target with its circles and the centre by its pose."""
+    """Return what to draw of a target: its circles and its centre, projected with its pose."""
     diameters_m = target.diameters_m
     circles = [contour_px(camera, pose, 0.5 * diameter_m) for diameter_m in diameters_m]
     radius_px = 0.5 * float(np.ptp(circles[0], axis=0).max())

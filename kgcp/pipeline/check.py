@@ -1,4 +1,4 @@
-"""A dry run: the content of a flight's folder, what follows from it, and the doubts about it."""
+"""A dry run: what a flight's folder contains, what kgcp concludes from it, and doubts about it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class FlightCheck:
     """The result of a dry run."""
 
     name: str  # of the flight
-    facts: Mapping[str, str]  # heading → content of the folder and what follows from it
+    facts: Mapping[str, str]  # heading → what there is and what kgcp concludes from it
     doubts: tuple[Doubt, ...]  # grave doubts first
 
     @property
@@ -49,7 +49,7 @@ class FlightCheck:
 
 @single_threaded()
 def check_flight(flight: Flight, *, stored_frames: StoredFolder | None = None) -> FlightCheck:
-    """Read everything but the pixels of a flight, and report doubts.
+    """Read everything of a flight except the pixels, and report facts and doubts.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def check_flight(flight: Flight, *, stored_frames: StoredFolder | None = None) -
     Raises
     ------
     KgcpError
-        If there are no frames. Other files that are missing or wrong are doubts.
+        If there are no frames. Other missing or wrong files are reported as doubts.
     """
     inputs = FlightInputs.of(
         flight, frames_below(stored_frames or flight.frames_folder), stored_frames
@@ -73,9 +73,10 @@ def doubts_before_detecting(
     stored_frames: StoredFolder | None = None,
     frame_patterns: Sequence[str] = (),
 ) -> tuple[Doubt, ...]:
-    """Return the doubts about a flight by some headers of the frames wanted, grave ones first.
+    """Return the doubts about a flight, from a sample of the chosen frames' headers.
 
-    Files that are missing or wrong are not among them: who needs them says so.
+    Grave doubts come first. Missing or wrong files are not reported here, but by the steps that
+    need them.
 
     Raises
     ------
@@ -94,7 +95,7 @@ def doubts_before_detecting(
 
 
 def facts_of(inputs: FlightInputs) -> dict[str, str]:
-    """Return what there is and what follows from it, in words, by its heading."""
+    """Return what there is and what kgcp concludes from it, in words, by heading."""
     facts = {
         "frames": _frames_text(inputs),
         "camera": _camera_text(inputs.flight.camera),
@@ -138,7 +139,7 @@ def _camera_text(camera: Camera) -> str:
 
 
 def _calibration_text(flight: Flight) -> str:
-    """Return how well the focal length is known, which scales every distance."""
+    """Return the accuracy of the focal length, and so of every distance, in words."""
     if flight.calibration_covariance is None:
         return (
             "accuracy not stated, so that reported accuracies leave it out; kgcp calibrate computes"
@@ -188,18 +189,18 @@ def _trajectory_text(inputs: FlightInputs) -> str:
     text = f"{len(trajectory.time_s)} epochs, {1.0 / interval:.3g} Hz, {span} UTC"
     if positions is not None and positions.vehicle is not None:
         steps = np.linalg.norm(np.diff(positions.vehicle.motion.position_m, axis=0), axis=1)
-        way = float(steps.sum())
-        text += f", {way:.0f} m" if way < 10_000.0 else f", {way / 1000.0:.0f} km"
+        length_m = float(steps.sum())
+        text += f", {length_m:.0f} m" if length_m < 10_000.0 else f", {length_m / 1000.0:.0f} km"
     return text + _sds_text(trajectory.sd_position_m)
 
 
 def _sds_text(sd_position_m: FloatArray | None) -> str:
     if sd_position_m is None:
         return ", no standard deviations"
-    usual_cm, worst_cm = 100.0 * np.median(sd_position_m, axis=0), 100.0 * sd_position_m.max()
-    text = f", σ {'/'.join(map(rounded, usual_cm.tolist()))} cm"
-    is_uneven = worst_cm > _UNEVEN_RATIO * usual_cm.max()  # as while GNSS is out
-    return f"{text}, at worst {rounded(worst_cm)} cm" if is_uneven else text
+    median_cm, largest_cm = 100.0 * np.median(sd_position_m, axis=0), 100.0 * sd_position_m.max()
+    text = f", σ {'/'.join(map(rounded, median_cm.tolist()))} cm"
+    is_uneven = largest_cm > _UNEVEN_RATIO * median_cm.max()  # for example during an outage of GNSS
+    return f"{text}, at worst {rounded(largest_cm)} cm" if is_uneven else text
 
 
 def _overlap_text(inputs: FlightInputs) -> str:
@@ -244,21 +245,23 @@ def _reference_text(inputs: FlightInputs) -> str:
 
 
 def _expected_text(inputs: FlightInputs) -> str:
-    """Return distances and radii: by the reference, or at a typical distance."""
+    """Return the expected distances and radii, by the reference poses or at a typical distance."""
     camera, target = inputs.flight.camera, inputs.flight.all_targets[0]
-    scale = 0.5 * target.outer_diameter_m * camera.mean_focal_px
+    radius_px_at_1_m = 0.5 * target.outer_diameter_m * camera.mean_focal_px
     if inputs.expected_radii_px is None:
         least = DetectSettings().min_radius_px
         if isinstance(target, PlainTarget):
             least = least_plain_px(target)
         return (
-            f"{target.name} has a radius of {scale / _TYPICAL_M:.0f} px at {_TYPICAL_M:g} m;"
-            f" it is found to some {scale / least:.0f} m ({least:g} px)"
+            f"{target.name} has a radius of {radius_px_at_1_m / _TYPICAL_M:.0f} px"
+            f" at {_TYPICAL_M:g} m;"
+            f" it is found to some {radius_px_at_1_m / least:.0f} m ({least:g} px)"
         )
     if not len(inputs.expected_radii_px):
         return f"{target.name} is in no frame, by the reference poses"
     large, small = inputs.expected_radii_px.max(), inputs.expected_radii_px.min()
     return (
-        f"{target.name} in {len(inputs.expected_radii_px)} frames, {scale / large:.1f} …"
-        f" {scale / small:.1f} m away, radius {large:.0f} … {small:.0f} px"
+        f"{target.name} in {len(inputs.expected_radii_px)} frames,"
+        f" {radius_px_at_1_m / large:.1f} … {radius_px_at_1_m / small:.1f} m away,"
+        f" radius {large:.0f} … {small:.0f} px"
     )

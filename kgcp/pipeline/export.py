@@ -39,7 +39,7 @@ _DEFAULT_SELECTION = Selection()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GcpSet:
-    """All points of an export, on one map.
+    """All points of an export, in one CRS.
 
     Attributes
     ----------
@@ -49,17 +49,17 @@ class GcpSet:
         CRS of all coordinates.
     gcps : tuple of Gcp
     skipped : tuple of SkippedSighting
-        Sightings that made no point, or a point that was not selected.
+        Sightings without a point, or whose point was not selected.
     camera_priors : tuple of CameraPrior
-        Position and attitude of the camera, from plate and vehicle.
+        Positions and attitudes of the camera, computed from plate and vehicle.
     vehicle : Vehicle or None
         None if no target is carried by a vehicle.
     consistency : Consistency or None
         None if there are no reference poses, or too few frames to compare.
     provenance : mapping of str
-        What the points were made from: the metadata of their tables.
+        Metadata of the points' tables: what the points were made from.
     doubts : tuple of Doubt
-        What does not fit, with its likely cause, grave doubts first.
+        What does not fit, with its likely cause; grave doubts come first.
     """
 
     flight: Flight
@@ -86,21 +86,23 @@ def make_gcps(
     selection: Selection = _DEFAULT_SELECTION,
     crs: str | None = None,
 ) -> GcpSet:
-    """Make ground control points of a flight's detections and its vehicle's trajectory.
+    """Make ground control points from a flight's detections and its vehicle's trajectory.
 
-    Reference poses are mostly made after the points: a file that is not there yet is not an error.
+    Reference poses are mostly computed later, with the points: it is not an error if their file
+    does not exist yet.
 
     Parameters
     ----------
     detections : Path, optional
-        What `detect_flight` wrote; by default in the flight's results folder.
+        The table that `detect_flight` wrote; by default that of the flight's results folder.
     crs : str, optional
-        Of the points, for pyproj; by default the flight's.
+        CRS of the points, in any form that pyproj reads; by default that of the flight.
 
     Raises
     ------
     KgcpError
-        If nothing was measured or can be placed, a file is unreadable, or a CRS unusable.
+        If nothing was measured, no position can be computed, a file is unreadable, or a CRS is
+        unusable.
     """
     table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
     attempts = read_attempts(table, flight)
@@ -140,12 +142,12 @@ def make_gcps(
 def _sightings(
     table: Path, attempts: Sequence[Attempt], selection: Selection
 ) -> tuple[Sequence[Sighting], Sequence[SkippedSighting]]:
-    """Return the sightings for points, and those that are excluded.
+    """Return the sightings to make points from, and those that the user excluded.
 
     Raises
     ------
     KgcpError
-        If there are no sightings for points.
+        If there are no sightings to make points from.
     """
     measured = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
     if not measured:
@@ -184,13 +186,13 @@ def export_gcps(
     Parameters
     ----------
     formats : sequence of str
-        Names as in `kgcp export-gcp --list-formats`.
+        Names of formats, as in `kgcp export-gcp --list-formats`.
     folder : Path, optional
-        Of the files; by default the flight's results folder.
+        Folder of the files; by default the flight's results folder.
     mark_floor_px : float
-        Least standard deviation of a mark in the files of packages [px].
+        Least standard deviation of a mark in the files for other programs [px].
     image_extensions : bool
-        Whether names of images end in their extension, in formats whose users may have removed it.
+        Whether image names have their extension, in formats whose packages may omit it.
 
     Raises
     ------
@@ -225,9 +227,9 @@ def write_formats(points: MapPoints, formats: Sequence[str], folder: Path) -> li
 
 
 def write_gcps(gcp_set: GcpSet, folder: Path) -> list[Path]:
-    """Write `kgcps.parquet` and, with reference poses, the files of the consistency.
+    """Write `kgcps.parquet`, and the files of the consistency if there are reference poses.
 
-    Without reference poses, those of an earlier export are removed.
+    Otherwise the files of the consistency from an earlier export are removed.
 
     Raises
     ------

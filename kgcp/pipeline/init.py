@@ -1,4 +1,4 @@
-"""Draft of a flight.toml for a folder without one, with what is found there and what is missing."""
+"""Draft of a flight.toml for a folder that has none, and a report of what was found and missing."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from kgcp.targets.layout import Target
 _FRAMES_CSV = "frames.csv"
 _NO_OPTIONS = InitOptions()
 _HEAD = (
-    '# Written by kgcp init from what lies in this folder. Lines with "# key = value" are not',
-    f"# set; those marked {MISSING} are needed. docs/flight_toml.md explains every key.",
+    '# Written by kgcp init from the files of this folder. Lines "# key = value" are comments and',
+    f"# set nothing; fill in those marked {MISSING}. docs/flight_toml.md explains every key.",
 )
 _UNKNOWN_POSITION = DraftKey(
-    "position_m", None, "if it stands still", "[689412.0, 5336208.0, 545.0]", is_missing=True
+    "position_m", None, "if the target is static", "[689412.0, 5336208.0, 545.0]", is_missing=True
 )
 _SD_POSITION = DraftKey(
     "sd_position_m", None, "how well it is surveyed, 1 σ", "[0.01, 0.01, 0.015]"
@@ -44,7 +44,7 @@ _SD_POSITION = DraftKey(
 _EXAMPLE_TARGET = (
     "",
     "# [[target]]",
-    f"# {MISSING}: the tables of targets.toml, which kgcp target writes:",
+    f"# {MISSING}: copy the tables of targets.toml, which kgcp target writes, for example:",
     '# name = "A"',
     "# outer_diameter_m = 0.9",
     "# inner_diameter_m = 0.45",
@@ -56,12 +56,13 @@ _EXAMPLE_TARGET = (
 
 @dataclass(frozen=True, slots=True)
 class FlightDraft:
-    """A flight.toml that is not yet written, with its reasons."""
+    """A flight.toml that is not written yet, with the origin of its values and what is missing."""
 
     toml_text: str
-    # times of the frames if their names have them; None: they are in another file, or unknown
+    # text of a frames.csv if the frames' names contain times; None: they are in another file, or
+    # unknown
     frames_csv: str | None
-    findings: tuple[InitFinding, ...]  # what was found in the folder, and where
+    findings: tuple[InitFinding, ...]  # information found in the folder, with its source
     gaps: tuple[Gap, ...]  # what is missing, and what to do about it
 
 
@@ -71,7 +72,7 @@ def draft_flight(folder: Path, options: InitOptions = _NO_OPTIONS) -> FlightDraf
     Raises
     ------
     KgcpError
-        If there is a flight.toml, no folder, or no frames, or an option is wrong.
+        If the folder does not exist, has a flight.toml already or no frames, or an option is wrong.
     """
     _require_new(folder)
     contents = survey_folder(folder)
@@ -79,22 +80,22 @@ def draft_flight(folder: Path, options: InitOptions = _NO_OPTIONS) -> FlightDraf
         read_frame_header(contents.frames_folder / frame, frame) for frame in contents.frames
     ]
     times = _times(contents, headers)
-    frames = Section.of("[frames]", (*_of_frames(contents), *times.parts))
+    frames = Section.of("[frames]", (*_frames_parts(contents), *times.parts))
     vehicle = vehicle_section(contents, times.time_s, options)
     targets, surveyed = _targets_section(contents, options)
     crs = crs_parts(contents, headers, surveyed, options)
     top = Section.of("", (DraftKey("name", _name_of(folder)), *crs))
     camera = camera_section(contents, headers)
-    reference = Section.of("[reference]", _of_reference(contents))
+    reference = Section.of("[reference]", _reference_parts(contents))
     written = (top, frames, camera, targets, vehicle, reference)
-    told = (frames, camera, targets, top, vehicle, reference)
+    reported = (frames, camera, targets, top, vehicle, reference)
     blocks = (block for section in written for block in section.blocks)
     lines = [*_HEAD, *(line for block in blocks for line in block.lines())]
     return FlightDraft(
         "\n".join(lines) + "\n",
         times.frames_csv,
-        tuple(finding for section in told for finding in section.findings),
-        tuple(gap for section in told for gap in section.gaps),
+        tuple(finding for section in reported for finding in section.findings),
+        tuple(gap for section in reported for gap in section.gaps),
     )
 
 
@@ -130,7 +131,7 @@ def _name_of(folder: Path) -> str:
     return name.strip()[:100] or "flight"
 
 
-def _of_frames(contents: FolderContents) -> Iterator[Part]:
+def _frames_parts(contents: FolderContents) -> Iterator[Part]:
     suffixes = Counter(PurePosixPath(frame).suffix.lower() for frame in contents.frames)
     kinds = ", ".join(f"{count} {suffix}" for suffix, count in suffixes.most_common())
     folder = contents.relative(contents.frames_folder)
@@ -148,14 +149,14 @@ class _Times:
 
 
 def _times(contents: FolderContents, headers: Sequence[FrameHeader]) -> _Times:
-    """Return the frames' times by the first source that has some: file, names, EXIF."""
-    refused = []
+    """Return the frames' times from the first source that has any: a file, names, or EXIF."""
+    unreadable = []
     for path in (*contents.times, *contents.marks, *contents.events):
         name = contents.relative(path)
         try:
             known = read_times(path, contents.frames).time_s
         except KgcpError as error:
-            refused.append(Gap("times", str(error).removeprefix(f"{path}: "), f"correct {name}"))
+            unreadable.append(Gap("times", str(error).removeprefix(f"{path}: "), f"correct {name}"))
             continue
         time_s = {frame: known[frame] for frame in contents.frames if frame in known}
         if time_s:
@@ -166,23 +167,25 @@ def _times(contents: FolderContents, headers: Sequence[FrameHeader]) -> _Times:
             return _Times(time_s, (key, found, *((gap,) if lacking else ())))
     if (by_name := times_of_names(contents.frames)) is not None:
         rows = [(frame, format_time(moment)) for frame, moment in by_name.items()]
-        key = DraftKey("times", _FRAMES_CSV, "made by kgcp init of the frames' names")
+        key = DraftKey("times", _FRAMES_CSV, "made by kgcp init from the frames' names")
         text = f"{_span(by_name)}, from the frames' names, as {_FRAMES_CSV}"
         csv = csv_text(("frame", "time"), rows)
         return _Times(by_name, (key, InitFinding("times", text)), csv)
     time_s = {each.frame: each.time_s for each in headers if each.time_s is not None}
-    parts = _of_exif_times(time_s, is_moving=bool(contents.trajectories))
-    return _Times(time_s, (*refused, *parts))
+    parts = _exif_time_parts(time_s, is_moving=bool(contents.trajectories))
+    return _Times(time_s, (*unreadable, *parts))
 
 
-def _of_exif_times(time_s: Mapping[str, float], *, is_moving: bool) -> Iterator[Part]:
+def _exif_time_parts(time_s: Mapping[str, float], *, is_moving: bool) -> Iterator[Part]:
     remedy = "give the camera's Timestamp.MRK, or frames.csv with the columns frame and time"
     is_missing = is_moving and not time_s
-    yield DraftKey("times", None, "without it: EXIF", '"frames.csv"', is_missing=is_missing)
+    yield DraftKey(
+        "times", None, "without it, EXIF times are used", '"frames.csv"', is_missing=is_missing
+    )
     why = "neither a file nor EXIF has the frames' times with their zone"
     if time_s:
         yield InitFinding("times", f"{_span(time_s)}, from EXIF ({len(time_s)} frames)")
-        why = "EXIF is rarely good to a millisecond, in which a vehicle moves a centimetre"
+        why = "EXIF times are rarely good to a millisecond, in which a vehicle moves a centimetre"
     elif not is_moving:
         yield InitFinding("times", f"none: {why}; static targets need none")
     if is_moving:
@@ -196,53 +199,55 @@ def _span(time_s: Mapping[str, float]) -> str:
 def _targets_section(
     contents: FolderContents, options: InitOptions
 ) -> tuple[Section, tuple[PointTable, ...]]:
-    """Return the [[target]] tables, as the user or a targets.toml says, and whose places they have.
+    """Return the [[target]] tables, and the tables of points from which positions were taken.
 
-    A target that a table of points names stands there; the others are carried by the vehicle.
+    The targets come from the options or a targets.toml. Those that a table of points names are
+    static; the vehicle carries the others.
     """
     targets, source = _targets(contents, options)
     if not targets:
         gap = Gap(
             "targets",
-            "no targets.toml lies in the folder",
+            "there is no targets.toml in the folder",
             "copy the targets.toml of kgcp target there, or give the target's diameters and code",
         )
         return Section((DraftText(_EXAMPLE_TARGET),), (), (gap,)), ()
-    places, surveyed = _places(contents, targets)
+    positions_m, surveyed = _surveyed_positions(contents, targets)
     names = ", ".join(f"{each.name} ({each.ring.outer_diameter_m:g} m)" for each in targets)
     found = [InitFinding("targets", f"{names}, from {source}")]
-    if places:
+    if positions_m:
         files = ", ".join(contents.relative(points.path) for points in surveyed)
-        found.append(InitFinding("positions", f"of {', '.join(sorted(places))}, from {files}"))
+        found.append(InitFinding("positions", f"of {', '.join(sorted(positions_m))}, from {files}"))
     is_carried = bool(contents.trajectories)
-    lost = [
+    unplaced = [
         each.name
         for each in targets
-        if each.name not in places and each.position_m is None and not is_carried
+        if each.name not in positions_m and each.position_m is None and not is_carried
     ]
     blocks = tuple(
-        _block(each, places.get(each.name), is_lost=each.name in lost) for each in targets
+        _block(each, positions_m.get(each.name), is_unplaced=each.name in unplaced)
+        for each in targets
     )
-    trajectory = "no trajectory is recognised" if contents.unknown else "there is no trajectory"
+    why = "no trajectory is recognised" if contents.unknown else "there is no trajectory"
     gap = Gap(
         "positions",
-        f"nothing says where {', '.join(lost)} {'is' if len(lost) == 1 else 'are'}: {trajectory},"
+        f"nothing says where {', '.join(unplaced)} {'is' if len(unplaced) == 1 else 'are'}: {why},"
         " and no table of surveyed points with that name",
         "write position_m = [x, y, z] below the target, or put the vehicle's trajectory or a table"
         " with the columns name, x, y, z into the folder before kgcp init",
     )
-    return Section(blocks, tuple(found), (gap,) if lost else ()), surveyed
+    return Section(blocks, tuple(found), (gap,) if unplaced else ()), surveyed
 
 
 def _block(
-    target: Target, position_m: tuple[float, float, float] | None, *, is_lost: bool
+    target: Target, position_m: tuple[float, float, float] | None, *, is_unplaced: bool
 ) -> DraftText:
-    """Return the tables of a target, with its position in the first of them."""
+    """Return the tables of a target and its replicas; its position is in the first of them."""
     placed = target if position_m is None else replace(target, position_m=position_m)
     plate = tuple(target_lines(replace(placed, replicas=())))
     replicas = tuple(target_lines(placed))[len(plate) :]
-    unknown = (_UNKNOWN_POSITION.line(),) if is_lost else ()
-    is_static = is_lost or placed.position_m is not None
+    unknown = (_UNKNOWN_POSITION.line(),) if is_unplaced else ()
+    is_static = is_unplaced or placed.position_m is not None
     sd = (_SD_POSITION.line(),) if is_static and not any(placed.sd_position_m) else ()
     return DraftText((*plate, *unknown, *sd, *replicas))
 
@@ -261,25 +266,25 @@ def _targets(contents: FolderContents, options: InitOptions) -> tuple[tuple[Targ
     return (), ""
 
 
-def _places(
+def _surveyed_positions(
     contents: FolderContents, targets: Sequence[Target]
 ) -> tuple[dict[str, tuple[float, float, float]], tuple[PointTable, ...]]:
-    """Return the surveyed positions of targets by name, and the tables that have them."""
-    places: dict[str, tuple[float, float, float]] = {}
+    """Return the surveyed positions of targets by name, and the tables of points that have them."""
+    positions_m: dict[str, tuple[float, float, float]] = {}
     used = []
     names = {target.name for target in targets}
     for points in contents.points:
-        own = {name: place for name, place in points.positions().items() if name in names}
+        own = {name: position_m for name, position_m in points.positions().items() if name in names}
         if own:
             used.append(points)
-            places = {**own, **places}
-    return places, tuple(used)
+            positions_m = {**own, **positions_m}
+    return positions_m, tuple(used)
 
 
-def _of_reference(contents: FolderContents) -> Iterator[Part]:
+def _reference_parts(contents: FolderContents) -> Iterator[Part]:
     if contents.references:
         name = contents.relative(contents.references[0])
         yield DraftKey("poses", name)
         yield InitFinding("reference", f"poses of the camera, from {name}")
     else:
-        yield DraftKey("poses", None, "the camera's poses of an adjustment", '"reference.csv"')
+        yield DraftKey("poses", None, "poses of the camera from an adjustment", '"reference.csv"')

@@ -14,17 +14,19 @@ from kgcp.io.formats.calibrations import read_calibration
 from kgcp.pipeline.init_records import Gap, InitFinding, Section
 from kgcp.quality.checks.frame_header import FrameHeader
 
-_SMALL_FRAME_MM = math.hypot(36.0, 24.0)  # its diagonal, to which CIPA's equivalents refer
-# Frames with a larger aspect ratio than the first are cropped from sensors with the second ratio of
-# height to width.
+_SMALL_FRAME_MM = math.hypot(
+    36.0, 24.0
+)  # diagonal of 35 mm film, to which CIPA's equivalent focal lengths refer
+# Frames whose ratio of width to height is above the first number are assumed to be cropped from a
+# sensor whose ratio of height to width is the second number.
 _WIDE_ASPECT, _FULL_SHAPE = 1.7, 0.75
 _PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _DIGITS = 9
-# Standard deviations of a guess. Focal length by EXIF: equivalents are whole millimetres, and real
-# lenses differ from their nominal focal length by a few per cent. Principal point and distortion of
-# an unknown lens: typical values of consumer cameras.
+# Standard deviations of a guess. EXIF states equivalent focal lengths in whole millimetres, and the
+# focal length of a real lens differs from its nominal value by a few per cent. The values for
+# principal point and distortion are typical of consumer cameras.
 _SD_FOCAL, _SD_CENTRE, _SD_K1 = 0.03, 0.01, 0.1
-_SD_FACTORY = 0.001  # of a focal length by the manufacturer; see docs/calibrations.md
+_SD_FACTORY = 0.001  # of a focal length calibrated by the manufacturer; see docs/calibrations.md
 _REMEDY = (
     "put a calibration file into the folder before kgcp init, or write its values, or file = …,"
     " into [camera]"
@@ -34,10 +36,10 @@ _RESPONSE = DraftKey("response", None, 'or "srgb": how grey values follow light'
 
 
 def camera_section(contents: FolderContents, headers: Sequence[FrameHeader]) -> Section:
-    """Return the [camera] table of some frames, from the best source that there is."""
+    """Return the [camera] table for frames, from the best source that is available."""
     sizes = Counter(header.size_px for header in headers if header.size_px is not None)
     if not sizes:
-        return _no_camera(None, "the frames' headers do not tell their size")
+        return _no_camera(None, "the headers of the frames do not state their size")
     size = max(sizes, key=lambda each: (sizes[each], each))
     first = next(header for header in headers if header.size_px == size)
     for section in (
@@ -47,11 +49,11 @@ def camera_section(contents: FolderContents, headers: Sequence[FrameHeader]) -> 
     ):
         if section is not None:
             return section
-    return _no_camera(size, "neither EXIF nor a file of the folder tells the focal length")
+    return _no_camera(size, "neither EXIF nor a file of the folder states the focal length")
 
 
 def _by_file(contents: FolderContents, size: tuple[int, int]) -> Section | None:
-    """Return the first calibration file of frames of this size."""
+    """Return the section by the first calibration file that is for frames of this size."""
     for path in contents.calibrations:
         try:
             camera = read_calibration(path, size)
@@ -94,7 +96,7 @@ def _by_dewarp_data(
     keys = (
         *_size_keys(size),
         *_parameter_keys(camera),
-        DraftKey("sd_fx", sd_px, "ASSUMED: 1 in 1000, as of factory calibrations"),
+        DraftKey("sd_fx", sd_px, "ASSUMED: 1 in 1000, as usual for factory calibrations"),
         DraftKey("sd_fy", sd_px),
         _RESPONSE,
         _SHUTTER,
@@ -109,7 +111,7 @@ def _by_dewarp_data(
 
 
 def _by_focal_length(headers: Sequence[FrameHeader], size: tuple[int, int]) -> Section | None:
-    """Return a guess from EXIF, with its possible error."""
+    """Return the section by a guess from EXIF, with its standard deviations."""
     guesses = (_guessed_px(header) for header in headers if header.size_px == size)
     guess = next((guess for guess in guesses if guess is not None), None)
     if guess is None:
@@ -123,7 +125,7 @@ def _by_focal_length(headers: Sequence[FrameHeader], size: tuple[int, int]) -> S
         DraftKey("guessed", value=True, comment="delete this line once a calibration is given"),
         *_size_keys(size),
         *_parameter_keys(camera),
-        DraftKey("sd_fx", sd_px, "what the guess may be wrong by, 1 σ"),
+        DraftKey("sd_fx", sd_px, "standard deviation of the guess"),
         *(DraftKey(f"sd_{key}", sd) for key, sd in (("fy", sd_px), ("cx", centre_px))),
         *(DraftKey(f"sd_{key}", sd) for key, sd in (("cy", centre_px), ("k1", _SD_K1))),
         _RESPONSE,
@@ -142,7 +144,7 @@ def _by_focal_length(headers: Sequence[FrameHeader], size: tuple[int, int]) -> S
 
 
 def _guessed_px(header: FrameHeader) -> tuple[FrameHeader, float, str] | None:
-    """Return a focal length by EXIF [px], and its source in words."""
+    """Return the header, the focal length that it states [px], and the source in words."""
     if header.size_px is None:
         return None
     where = f"EXIF of {header.frame}"
@@ -190,7 +192,7 @@ def _size_keys(size: tuple[int, int]) -> tuple[DraftKey, DraftKey]:
 
 
 def _parameter_keys(camera: Camera) -> tuple[DraftKey, ...]:
-    """Return the parameters that are not zero, and the four that a table must have."""
+    """Return keys for the parameters that are not zero, and for the four that are required."""
     values = {key: float(f"{getattr(camera, key):.{_DIGITS}g}") for key in _PARAMETERS}
     kept = {key: value for key, value in values.items() if value or key in _PARAMETERS[:4]}
     return tuple(DraftKey(key, value) for key, value in kept.items())

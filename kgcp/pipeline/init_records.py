@@ -1,4 +1,4 @@
-"""Records of `kgcp init`: what it found in a folder, what is missing, parts of flight.toml."""
+"""Records of `kgcp init`: information found, information missing, and parts of flight.toml."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kgcp.io.flight.toml_draft import DraftKey, DraftTable, DraftText
 
 @dataclass(frozen=True, slots=True)
 class InitFinding:
-    """One piece of information in the folder, and where it was found."""
+    """Information that was found in the folder, with its source, as a line of the report."""
 
     heading: str
     text: str
@@ -19,21 +19,21 @@ class InitFinding:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """One missing piece of information, and what to do about it."""
+    """Information that is missing or only assumed, and what to do about it."""
 
     heading: str
     text: str
     remedy: str
-    is_assumed: bool = False  # whether flight.toml gets a value that nothing confirms
+    is_assumed: bool = False  # whether flight.toml has a value that no file confirms
 
 
 Part = DraftKey | InitFinding | Gap
-"""One line of a table, or a reason for its lines."""
+"""A key of a table, or a line of the report about the table's keys."""
 
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A part of flight.toml, with the reasons for it."""
+    """A part of flight.toml, with the lines of the report about it."""
 
     blocks: tuple[DraftTable | DraftText, ...]
     findings: tuple[InitFinding, ...]
@@ -41,7 +41,7 @@ class Section:
 
     @classmethod
     def of(cls, heading: str, parts: Iterable[Part], note: str = "") -> Section:
-        """Sort the parts of one table, each kind in its order."""
+        """Make a section of one table; parts of each kind keep their order."""
         parts = tuple(parts)
         keys = tuple(part for part in parts if isinstance(part, DraftKey))
         return cls(
@@ -53,12 +53,12 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class InitOptions:
-    """What the user states in addition to the files in the folder; None or empty: nothing."""
+    """Information from the user besides the files in the folder; None or empty: not given."""
 
     targets_file: Path | None = None  # a flight.toml, or the targets.toml of `kgcp target`
-    # directions of the dots of targets, separated by commas [deg]; they need `diameter_m`
+    # for each target, the directions of its dots, separated by commas [deg]; needs `diameter_m`
     codes: tuple[str, ...] = ()
-    diameter_m: float | None = None  # their outer diameter [m]
+    diameter_m: float | None = None  # outer diameter of these targets [m]
     # trajectory point → target centre: forward, right, down [m]
     lever_arm_m: tuple[float, float, float] | None = None
     crs: str | None = None  # of the flight, for pyproj

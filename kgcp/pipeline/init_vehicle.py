@@ -25,7 +25,7 @@ _WORDS = {
     "csv": "CSV table",
     "tum": "TUM trajectory",
 }
-_WEEK_S = 2e6  # seconds of a week are below, Unix seconds far above
+_WEEK_S = 2e6  # seconds of a week are less than this; Unix seconds are far larger
 _SHOWN_CRS = 3
 _SHOWN_FILES = 5
 _CRS_REMEDY = "write crs = … into flight.toml: the CRS of the surveyed coordinates"
@@ -35,21 +35,21 @@ _LEVER_ARM = "forward, right, down [m] to the target"
 def vehicle_section(
     contents: FolderContents, times_s: Mapping[str, float], options: InitOptions
 ) -> Section:
-    """Return [vehicle] of the one trajectory that lies in a folder.
+    """Return the [vehicle] table: for the only trajectory of a folder, or to be filled in.
 
     Parameters
     ----------
     times_s : mapping
-        Times of the frames, Unix UTC [s]: they tell the week of a trajectory that has seconds of
-        the week.
+        Times of the frames, Unix UTC [s]: they determine the week of a trajectory whose times are
+        seconds of the week.
     """
     if len(contents.trajectories) == 1:
-        return Section.of("[vehicle]", _of_trajectory(contents, times_s, options))
+        return Section.of("[vehicle]", _trajectory_parts(contents, times_s, options))
     note = "Only if a vehicle carries the target."
-    return Section.of("[vehicle]", _without_trajectory(contents), note)
+    return Section.of("[vehicle]", _missing_trajectory_parts(contents), note)
 
 
-def _of_trajectory(
+def _trajectory_parts(
     contents: FolderContents, times_s: Mapping[str, float], options: InitOptions
 ) -> Iterator[Part]:
     file = contents.trajectories[0]
@@ -59,30 +59,30 @@ def _of_trajectory(
     attitude_keys, attitude_text = _attitude(file)
     text = f"{name}: {_WORDS[file.format]}{layout_text}{attitude_text}"
     yield InitFinding("trajectory", text)
-    yield DraftKey("trajectory", name, f"{_WORDS[file.format]}, by its content")
+    yield DraftKey("trajectory", name, f"{_WORDS[file.format]}, recognised by its content")
     yield from layout_keys
     if start is None:
-        yield Gap("trajectory", f"{name} cannot be read", "see what kgcp check says of it")
-    elif start.crs is not None and file.format not in {"sbet", "rtklib"}:  # these always are
+        yield Gap("trajectory", f"{name} cannot be read", "run kgcp check, which says why")
+    elif start.crs is not None and file.format not in {"sbet", "rtklib"}:  # these always have it
         yield DraftKey("crs", start.crs, "x, y are longitude and latitude")
-    yield from _of_times(file, start, times_s)
+    yield from _time_parts(file, start, times_s)
     if file.format == "sbet" and contents.accuracies:
         yield DraftKey("accuracies", contents.relative(contents.accuracies[0]))
     yield from attitude_keys
-    yield from _of_lever_arm(options)
+    yield from _lever_arm_parts(options)
     yield DraftKey("sd_time_s", None, "synchronisation of frames and trajectory, 1 σ", "0.001")
-    yield DraftKey("level_sd_deg", None, "if the plate is level within this, 1 σ", "1.0")
+    yield DraftKey("level_sd_deg", None, "if the plate is level: standard deviation", "1.0")
 
 
-def _without_trajectory(contents: FolderContents) -> Iterator[Part]:
-    """Yield a table to be filled in."""
+def _missing_trajectory_parts(contents: FolderContents) -> Iterator[Part]:
+    """Yield the keys to be filled in, and the files that may be or are not a trajectory."""
     yield DraftKey("trajectory", None, "the rover's file", '"rover.pos"')
     yield DraftKey("lever_arm_m", None, _LEVER_ARM, "[-0.8, 0.15, -1.95]")
     if contents.trajectories:
         names = ", ".join(contents.relative(file.path) for file in contents.trajectories)
         yield Gap(
             "trajectory",
-            f"several files may be it: {names}",
+            f"several files may be the trajectory: {names}",
             "leave one of them in the folder, or fill in [vehicle]",
         )
     elif contents.unknown:
@@ -90,8 +90,8 @@ def _without_trajectory(contents: FolderContents) -> Iterator[Part]:
         more = " …" if len(contents.unknown) > _SHOWN_FILES else ""
         yield InitFinding(
             "not recognised",
-            f"{shown}{more}; a table is a trajectory if its first line names time, x, y, z, or"
-            " longitude, latitude, height, in degrees and metres",
+            f"{shown}{more}; a table is recognised as a trajectory if its first line names time,"
+            " and x, y, z or longitude, latitude, height, in degrees and metres",
         )
 
 
@@ -101,17 +101,17 @@ def crs_parts(
     surveyed: Sequence[PointTable],
     options: InitOptions,
 ) -> Iterator[Part]:
-    """Yield the flight's crs: as said, or by surveyed points or trajectory, or what it may be.
+    """Yield the flight's crs: as given, or found by surveyed points or trajectory, or unknown.
 
     Parameters
     ----------
     surveyed : sequence of PointTable
-        Whose coordinates flight.toml takes over.
+        Tables whose coordinates are written to flight.toml.
 
     Raises
     ------
     KgcpError
-        If the given CRS is none.
+        If pyproj cannot read the given CRS.
     """
     if options.crs is not None:
         parse_crs(options.crs, "crs")
@@ -124,14 +124,14 @@ def crs_parts(
     source = "" if file is None else contents.relative(file.path)
     if surveyed and surveyed[0].first_xy is not None:
         path = contents.relative(surveyed[0].path)
-        yield from _crs_by_place(path, surveyed[0].first_xy, place)
+        yield from _crs_parts_by_place(path, surveyed[0].first_xy, place)
     elif start is None:
         why = f"{source} cannot be read" if source else "nothing in the folder has coordinates"
-        yield from _unknown_crs(why)
+        yield from _unknown_crs_parts(why)
     elif start.crs is None:
-        yield from _crs_by_place(source, (start.x, start.y), place)
+        yield from _crs_parts_by_place(source, (start.x, start.y), place)
     elif place is None:
-        yield from _unknown_crs(f"{source} begins nowhere on Earth")
+        yield from _unknown_crs_parts(f"the first position of {source} is not on Earth")
     else:
         crs = utm_crs(*place)
         yield DraftKey("crs", crs, f"UTM zone of {source}; heights are ellipsoidal")
@@ -140,7 +140,7 @@ def crs_parts(
 
 
 def _place(start: FirstEpoch | None, headers: Sequence[FrameHeader]) -> tuple[float, float] | None:
-    """Return longitude and latitude of the flight [deg], by its trajectory or by a frame."""
+    """Return longitude and latitude of the flight [deg], from its trajectory or a frame's EXIF."""
     if start is not None and start.crs is not None:
         place = longitude_latitude(start.crs, np.array([[start.x, start.y]]))[0]
         if np.isfinite(place).all() and is_geographic_place(*place):
@@ -151,36 +151,38 @@ def _place(start: FirstEpoch | None, headers: Sequence[FrameHeader]) -> tuple[fl
     return None
 
 
-def _crs_by_place(
+def _crs_parts_by_place(
     source: str, xy: tuple[float, float], place: tuple[float, float] | None
 ) -> Iterator[Part]:
-    """Yield the CRS in which coordinates lie where the flight was."""
+    """Yield the CRS in which some coordinates are near the place of the flight."""
     silent = f"{source} does not say in which CRS its coordinates are"
     if is_geographic_place(*xy):
         comment = f"longitude, latitude and ellipsoidal height in {source}"
         yield DraftKey("crs", WGS84_3D, comment)
         yield InitFinding("crs", f"{WGS84_3D}: {comment}")
     elif place is None:
-        yield from _unknown_crs(silent)
+        yield from _unknown_crs_parts(silent)
     elif not (near := projected_crs_near(*xy, *place)):
-        why = f"{silent}, and in none of EPSG's do they lie where the flight was"
-        yield from _unknown_crs(why)
+        why = f"{silent}, and in no CRS of EPSG are they near the place of the flight"
+        yield from _unknown_crs_parts(why)
     elif len(near) == 1:
-        yield DraftKey("crs", near[0], f"of {source}, by its place")
-        yield InitFinding("crs", f"{near[0]}: in it {source} lies where the flight was")
+        yield DraftKey("crs", near[0], f"the CRS in which {source} is near the place of the flight")
+        yield InitFinding(
+            "crs", f"{near[0]}: in this CRS, {source} is near the place of the flight"
+        )
     else:
         shown = " or ".join(near[:_SHOWN_CRS])
-        yield from _unknown_crs(f"{silent}; by the flight's place it may be {shown}", near[0])
+        yield from _unknown_crs_parts(f"{silent}; by the flight's place it may be {shown}", near[0])
 
 
-def _unknown_crs(why: str, likely: str = "EPSG:25832") -> Iterator[Part]:
-    comment = "of all coordinates; heights ellipsoidal"
+def _unknown_crs_parts(why: str, likely: str = "EPSG:25832") -> Iterator[Part]:
+    comment = "CRS of all coordinates; heights are ellipsoidal"
     yield DraftKey("crs", None, comment, f'"{likely}"', is_missing=True)
     yield Gap("crs", why, _CRS_REMEDY)
 
 
 def _layout(file: TrajectoryFile) -> tuple[tuple[DraftKey, ...], str]:
-    """Return the layout of a CSV file where it differs from kgcp's own."""
+    """Return keys and words for the layout of a CSV file where it differs from kgcp's own."""
     if file.table is None:
         return (), ""
     table = file.table.table
@@ -202,7 +204,7 @@ def _layout(file: TrajectoryFile) -> tuple[tuple[DraftKey, ...], str]:
     return tuple(keys), "".join(f"; {word}" for word in words)
 
 
-def _of_times(
+def _time_parts(
     file: TrajectoryFile, start: FirstEpoch | None, times_s: Mapping[str, float]
 ) -> Iterator[Part]:
     """Yield the time system of the file, and the day if its times are seconds of a week."""
@@ -211,12 +213,12 @@ def _of_times(
     named = None if file.table is None else file.table.time_system
     if NUMBER.fullmatch(start.time):
         if float(start.time) < _WEEK_S:
-            yield from _of_week(float(start.time), named, times_s)
+            yield from _week_parts(float(start.time), named, times_s)
         elif named is TimeSystem.GPS:
-            yield from _of_gps_seconds()
+            yield from _gps_seconds_parts()
         return
     if names_zone(start.time) is False:
-        yield from _of_zone(start.time, named)
+        yield from _zone_parts(start.time, named)
         return
     try:
         parse_time(start.time)
@@ -224,24 +226,24 @@ def _of_times(
         is_half = half_of_time(start.time) is not None
         why = ": date and time seem to stand in two columns" if is_half else ""
         remedy = f"{error.remedy}; then repeat kgcp init without this flight.toml"
-        yield Gap("trajectory", f"of its times, {error.problem}{why}", remedy)
+        yield Gap("trajectory", f"times of the trajectory: {error.problem}{why}", remedy)
 
 
-def _of_week(
+def _week_parts(
     seconds: float, named: TimeSystem | None, times_s: Mapping[str, float]
 ) -> Iterator[Part]:
-    """Yield the keys for seconds of the week, which the frames' times place in the calendar."""
+    """Yield the keys for seconds of the week; the frames' times tell which week it is."""
     system = named or TimeSystem.GPS
-    why = "by the name of its column" if named else "ASSUMED, as most programs write it"
-    yield DraftKey("time_system", system.value, f'{why}; else "utc"')
+    why = "by the name of its column" if named else "ASSUMED, since most programs write it"
+    yield DraftKey("time_system", system.value, f'{why}; otherwise "utc"')
     if times_s:
         day = first_day_near(seconds, min(times_s.values()), system)
-        yield DraftKey("date", day, "of the first epoch, by the frames' times")
+        yield DraftKey("date", day, "day of the first epoch, found from the frames' times")
     else:
         yield DraftKey("date", None, "day of the first epoch", "2026-05-04", is_missing=True)
         yield Gap(
             "trajectory",
-            f"its times, from {seconds:.1f} s on, are seconds of a week that nothing tells",
+            f"its times, from {seconds:.1f} s on, are seconds of a week, and no file says which",
             "write date = … into [vehicle]",
         )
     if not named:
@@ -253,9 +255,9 @@ def _of_week(
         )
 
 
-def _of_gps_seconds() -> Iterator[Part]:
-    """Yield the key for seconds since 1970 in a column of GPS time, which may still be Unix's."""
-    yield DraftKey("time_system", "gps", 'ASSUMED, by the name of its column; else "utc"')
+def _gps_seconds_parts() -> Iterator[Part]:
+    """Yield the key for seconds since 1970 in a column named after GPS, which may still be UTC."""
+    yield DraftKey("time_system", "gps", 'ASSUMED, by the name of its column; otherwise "utc"')
     yield Gap(
         "trajectory",
         "its times are GPS time, 18 s ahead of UTC, by the name of their column",
@@ -264,8 +266,8 @@ def _of_gps_seconds() -> Iterator[Part]:
     )
 
 
-def _of_zone(text: str, named: TimeSystem | None) -> Iterator[Part]:
-    """Yield the key for times without a zone."""
+def _zone_parts(text: str, named: TimeSystem | None) -> Iterator[Part]:
+    """Yield the key for times without a time zone."""
     if named is not None:
         yield DraftKey("time_system", named.value, "by the name of its column")
         return
@@ -285,13 +287,15 @@ def _attitude(file: TrajectoryFile) -> tuple[tuple[DraftKey, ...], str]:
     if has_attitude:
         return (), "; with attitude"
     keys = (
-        DraftKey("attitude", "course", "it has none: heading of the course, roll and pitch 0"),
+        DraftKey(
+            "attitude", "course", "the file has none: heading from the course, roll and pitch 0"
+        ),
         DraftKey("sd_attitude_deg", (2.0, 2.0, 3.0), "your estimate: roll, pitch, heading, 1 σ"),
     )
     return keys, "; without attitude: its heading is the course over ground"
 
 
-def _of_lever_arm(options: InitOptions) -> Iterator[Part]:
+def _lever_arm_parts(options: InitOptions) -> Iterator[Part]:
     if options.lever_arm_m is not None:
         yield DraftKey("lever_arm_m", options.lever_arm_m, _LEVER_ARM)
         yield InitFinding("lever arm", f"{list(options.lever_arm_m)} m, as given")
@@ -299,7 +303,7 @@ def _of_lever_arm(options: InitOptions) -> Iterator[Part]:
         yield DraftKey("lever_arm_m", None, _LEVER_ARM, "[-0.8, 0.15, -1.95]", is_missing=True)
         yield Gap(
             "lever arm",
-            "no file tells where the target is, seen from the trajectory's point",
+            "no file states where the target is relative to the trajectory's point",
             "measure it and write lever_arm_m = [forward, right, down] in metres into [vehicle]",
         )
     yield DraftKey("sd_lever_arm_m", None, "how well it is known, 1 σ", "[0.005, 0.005, 0.005]")

@@ -1,4 +1,4 @@
-"""Points of several flights merged into one set for one block."""
+"""Merge of the points of several flights into one set, for one block."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.export import GcpSet, write_formats
 
 OF_ONE_CAMERA = frozenset({"itwin", "opensfm"})
-"""Formats whose files hold the camera, or depend on its frames' size, and that need it."""
+"""Formats whose files contain one camera, or depend on the size of its frames."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MergedGcps:
-    """The points of several flights, on one map and with one set of ids.
+    """The points of several flights, in one CRS and with unique ids.
 
-    Frames are called by the flight's name and their path below its frames folder, `north/1.jpg`.
+    Names of frames are the flight's name and the path below its frames folder, `north/1.jpg`.
     Ids of moving points begin with the flight's name; a static target that several flights have
     seen is one point.
     """
 
-    parts: tuple[GcpSet, ...]  # of the flights
+    parts: tuple[GcpSet, ...]  # the points of each flight
     crs: str  # of all coordinates
     gcps: tuple[Gcp, ...]
     skipped: tuple[SkippedSighting, ...]
@@ -51,8 +51,8 @@ def merge_gcps(parts: Sequence[GcpSet]) -> MergedGcps:
     Raises
     ------
     KgcpError
-        If flights have the same name or different CRS, or a static target's name stands for two
-        places.
+        If flights have the same name or different CRS, or if static targets with the same name have
+        different positions.
     """
     _check_names(parts)
     _check_crs(parts)
@@ -118,7 +118,7 @@ def export_merged(
     Raises
     ------
     KgcpError
-        As `export_gcps`, and for a format of one camera if the flights have several.
+        As `export_gcps`, and for a format that holds one camera if the flights have several.
     """
     for name in formats:
         if name in OF_ONE_CAMERA and not merged.has_one_camera:
@@ -139,7 +139,7 @@ def export_merged(
 
 
 def write_merged(merged: MergedGcps, folder: Path) -> list[Path]:
-    """Write `kgcps.parquet` of all flights, and remove the consistency of an earlier export.
+    """Write one `kgcps.parquet` for all flights, and remove the consistency of an earlier export.
 
     Raises
     ------

@@ -309,7 +309,7 @@ def test_files_that_are_not_recognised_are_named(bare: Path, tmp_path: Path) -> 
     (folder / "rover.pos").unlink()
     (folder / "track.csv").write_text("time,E(ft),N(ft),U(ft)\n1,2,3,4\n", encoding="utf-8")
     said = " ".join(init(folder, *TARGET, *ARM).stderr.split())
-    assert "not recognised notes.txt, track.csv; a table is a trajectory if " in said
+    assert "not recognised notes.txt, track.csv; a table is recognised as a trajectory if " in said
     assert "nothing says where T1 is: no trajectory is recognised, and no table" in said
 
 
