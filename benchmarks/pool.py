@@ -1,4 +1,4 @@
-"""Work on many items by a pool of processes, in their order."""
+"""Apply a function to many items in a pool of processes, and keep their order."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def ordered_map(
     Parameters
     ----------
     function : callable
-        Importable, not a closure.
+        Must be importable, not a closure.
     jobs : int
-        Processes; 1 works in this one.
+        Number of processes; 1: all items are processed in this process.
     start : callable
         Called once per process with `start_arguments`, before any item.
     items_per_task : int
-        How many items travel to a process at once.
+        How many items are sent to a process at once.
     """
     if jobs == 1 or len(items) < 2:
         start(*start_arguments)

@@ -1,9 +1,10 @@
-"""Whether `kgcp target --new N` works for every N that it offers, and how far apart the codes are.
+"""Check `kgcp target --new N` for every N that it offers, and measure how far apart the codes are.
 
     python -m benchmarks.target_codes
 
-proposes 1 to 50 codes of 4, 5 and 6 dots, checks them as flight.toml is checked, and prints the
-least distance in dots and the time; some ten minutes. Fails if a number has no codes.
+This proposes 1 to 50 codes of 4, 5 and 6 dots, checks them as those of a flight.toml are checked,
+and prints their least distance in dots and the time. It takes some twenty minutes, and fails if it
+finds no codes for a number.
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ DOTS = (4, 5, 6)
 
 
 def distance_of(count: int, dots: int) -> float:
-    """Return how far apart so many proposed codes are [dots].
+    """Return the least distance of a number of proposed codes [dots].
 
     Raises
     ------
     SettingError
-        If there are not so many.
+        If it is not possible to propose so many codes.
     """
     targets = new_targets((), 0.9, (), count, dots)
     check_new_codes(targets, ())

@@ -1,4 +1,4 @@
-"""What was measured against the truth: errors row by row, figures by band of ring radius."""
+"""Comparison of measurements with the truth: errors by row, summaries by band of ring radius."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from kgcp.geometry.arrays import FloatArray
 
 RADIUS_BANDS_PX = ((26.0, np.inf), (13.0, 26.0), (9.0, 13.0), (0.0, 9.0))
-_AMBIGUITY_TILT_DEG = 8.0  # against the viewing ray; below it the two poses are nearly one
+_AMBIGUITY_TILT_DEG = 8.0  # tilt against the viewing ray below which the two poses nearly agree
 _ERROR_COLUMNS = (
     *("normal_error_deg", "tilt_deg", "on_right_side"),
     *("z_distance", "z_centre", "mahalanobis2"),
@@ -23,31 +23,33 @@ BOUND_COLUMNS = ("bound_distance_percent", "bound_centre_px", "bound_normal_deg"
 
 @dataclass(frozen=True)
 class BandResult:
-    """Figures of one band of ring radius; NaN where nothing can be said.
+    """Summary of one band of ring radius; NaN if there is nothing to compute a value from.
 
     Attributes
     ----------
     low_px, high_px : float
         The band [px].
     present, found, wrong : int
-        Frames with the target, with it found where it is, and with something else reported.
+        Frames with the target, frames in which it was found at its place, and wrong measurements.
     rms_percent, mean_percent, mean_2se_percent : float
-        Error of distance: RMS, mean, and two standard errors of the mean [%].
+        Errors of the distance: RMS, mean, and two standard errors of the mean [%].
     centre_rms_px : float
         Distance of the projected centre from the true one, RMS [px].
     normal_median_deg, right_side : float
-        Error of the plate's normal, median [deg], and share of normals on the right side of the
-        ambiguity; plates tilted by more than 8° against the viewing ray.
+        Median error of the plate's normal [deg], and share of normals that are nearer to the true
+        one than to its mirror image; of plates tilted by more than 8° against the viewing ray.
     tilted : int
-        How many those are.
+        Number of these plates.
     z_distance, z_centre : float
-        RMS of error over reported standard deviation, of distance and of the centre per axis.
+        RMS of the errors divided by their reported standard deviations: of the distance, and of
+        the centre per axis.
     worst_z_distance : float
-        Largest absolute error of distance over its standard deviation.
+        Largest absolute error of a distance divided by its standard deviation.
     mahalanobis2 : float
-        Median squared Mahalanobis distance of the pose; 5.35 for χ²₆.
+        Median squared Mahalanobis distance of the pose; ideally 5.35 (χ²₆).
     bound_distance, bound_centre, bound_normal : float
-        RMS of error over Cramér-Rao bound; the normals are those on the right side.
+        RMS of the errors divided by their Cramér-Rao bounds; of the normals, only those on the
+        right side.
     """
 
     low_px: float
@@ -72,7 +74,7 @@ class BandResult:
 
 
 def join_truth(detections: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
-    """Join every measured row with its frame's truth; rows of frames without a target stay.
+    """Join every measured row with its frame's truth; frames without a target keep their rows.
 
     Parameters
     ----------
@@ -84,9 +86,9 @@ def join_truth(detections: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        With `is_right` (measured where the target is), `is_wrong`, `centre_error_px`,
-        `error_percent`, and of right rows the errors of the pose. A measurement is wrong where
-        there is no target, or more than max(3 px, R/2) from the true centre.
+        With the columns `is_right` (measured at the target's place), `is_wrong`, `centre_error_px`,
+        `error_percent`, and for right rows the errors of the pose. A measurement is wrong if there
+        is no target, or if it is more than max(3 px, R/2) from the true centre.
     """
     measured = detections[detections["status"] == "measured"]
     table = truth.merge(measured, on="frame", how="left", suffixes=("_true", ""))
@@ -101,7 +103,7 @@ def join_truth(detections: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
 
 
 def _pose_errors(right: pd.DataFrame) -> pd.DataFrame:
-    """Return the errors of pose, and all errors in units of their standard deviations."""
+    """Return the errors of the pose, and all errors divided by their standard deviations."""
     elements = [f"r{row}{column}" for row in range(3) for column in range(3)]
     true_rotation = right[elements].to_numpy(float).reshape(-1, 3, 3)
     quaternions = np.array(right[["qw", "qx", "qy", "qz"]], float).reshape(-1, 4)
@@ -133,7 +135,7 @@ def _pose_errors(right: pd.DataFrame) -> pd.DataFrame:
 
 
 def _angles_deg(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the angles (n,) between unit vectors (n, 3), exact for small ones too [deg]."""
+    """Return the angles (n,) between unit vectors (n, 3) [deg], exact even if they are small."""
     angles: FloatArray = np.degrees(
         np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1))
     )
@@ -151,12 +153,12 @@ def _squared_mahalanobis(errors: FloatArray, covariances: pd.Series[float]) -> F
 
 
 def summarise(table: pd.DataFrame) -> list[BandResult]:
-    """Return the figures of every band of ring radius.
+    """Return the summary of every band of ring radius.
 
     Parameters
     ----------
     table : DataFrame
-        Of `join_truth`, with or without the columns of the bound.
+        Result of `join_truth`, with or without the columns of the bound.
     """
     return [_summarise_band(table, low, high) for low, high in RADIUS_BANDS_PX]
 
@@ -197,7 +199,7 @@ def _rms(values: pd.Series[float]) -> float:
 
 
 def table_lines(results: list[BandResult]) -> Iterator[str]:
-    """Yield the figures as a table: a line of titles, then one line per band."""
+    """Yield the summaries as a table: a header, then one line per band."""
     yield (
         "      R px  found/present wrong  distance RMS %       mean % ± 2 se  centre px"
         "   normal ° right side  z dist (worst)  z centre  Mahal.²  / bound: dist centre normal"

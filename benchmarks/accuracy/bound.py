@@ -1,6 +1,6 @@
 """Cramér-Rao bound of one simulated frame, by `kgcp.simulation.crlb`.
 
-See benchmarks/README.md for what is taken as unknown and what is left out.
+benchmarks/README.md lists what the bound treats as unknown and what it leaves out.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from kgcp.simulation.presets import SimulationSettings
 
 
 def frame_bound(settings: SimulationSettings, frame: FramePlan) -> Bound:
-    """Return the bound of a frame that shows the target; the streak is unknown if there is one."""
+    """Return the bound of a frame that shows the target; a streak is unknown if there is one."""
     return bound_of(
         Shot(
             camera=settings.camera,

@@ -1,13 +1,13 @@
-"""Single frames by cameras and in light drawn at random, for what goes wrong only in company.
+"""Single frames with random cameras and light, to find faults of combinations of effects.
 
 Usage: python -m benchmarks.accuracy.combinations [--frames 400] [--first 0] [--jobs 2]
 
 Each frame has a target of R 7 to 140 px and its own camera (known or unknown response, sharpening
 of any radius, noise, a phone's processing), lens, defocus, motion, exposure, shadows, dirt,
-highlight and compression. Columns: targets that were measured of all, mean and RMS standardised
-error of the distance, RMS of that of the centre, and distances off by more than three standard
-deviations. A frame belongs to several lines. The five worst are named by their number, which is all
-that they are drawn from.
+highlight and compression. Columns: number of targets measured and shown; mean and RMS of the
+standardised errors of the distance; RMS of those of the centre; number of distances that are off by
+more than three standard deviations. A frame may belong to several lines. The five worst frames are
+listed by number; the number is the seed of all random choices of a frame.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from kgcp.simulation.presets import SimulationSettings, preset
 _PLAIN = preset("clean")
 _OUTER_RADIUS_M = 0.5 * TARGET_PLATE.target.ring.outer_diameter_m
 _FOCAL_PX, _LEAST_DISTANCE_M = _PLAIN.camera.mean_focal_px, 7.5
-_LARGE_PX = 110.0  # from this radius on, frames are larger
-_GROUNDS = 4  # seeds of the surroundings, which take seconds to grow
+_LARGE_PX = 110.0  # ring radius from which larger frames are rendered
+_GROUNDS = 4  # number of different surroundings; each takes seconds to generate
 _CAMERAS = (
     (ToneCurve.LINEAR, Response.LINEAR),
     (ToneCurve.SRGB, Response.SRGB),
@@ -45,8 +45,8 @@ _CAMERAS = (
 )
 
 
-def drawn(number: int) -> SimulationSettings:
-    """Return the settings of the frame of this number."""
+def random_settings(number: int) -> SimulationSettings:
+    """Return the randomly drawn settings of the frame with this number."""
     rng = np.random.default_rng(number)
     radius_px = _log_uniform(rng, 7.0, 140.0)
     distance_m = max(_OUTER_RADIUS_M * _FOCAL_PX / radius_px, _LEAST_DISTANCE_M)
@@ -56,7 +56,7 @@ def drawn(number: int) -> SimulationSettings:
     width, height = (840, 700) if radius_px > _LARGE_PX else (680, 540)
     tilt_deg = float(rng.uniform(0.0, 45.0 if rng.random() < 0.4 else 12.0))
     psf_px, gain = float(rng.uniform(0.45, 1.5)), _log_uniform(rng, 0.35, 2.2)
-    streak_px = _now_and_then(rng, 0.25, 4.0)
+    streak_px = _sometimes_zero(rng, 0.25, 4.0)
     return replace(
         _PLAIN,
         frames=1,
@@ -95,7 +95,7 @@ def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return math.exp(rng.uniform(math.log(low), math.log(high)))
 
 
-def _now_and_then(rng: np.random.Generator, share: float, most: float) -> float:
+def _sometimes_zero(rng: np.random.Generator, share: float, most: float) -> float:
     return float(rng.uniform(0.0, most)) if rng.random() < share else 0.0
 
 
@@ -106,11 +106,11 @@ def _phone(rng: np.random.Generator) -> Phone:
 
 def _lens(rng: np.random.Generator) -> Aberration:
     return Aberration(
-        astigmatism=1.0 + _now_and_then(rng, 0.4, 0.6),
+        astigmatism=1.0 + _sometimes_zero(rng, 0.4, 0.6),
         astigmatism_deg=float(rng.uniform(0.0, 180.0)),
-        coma=_now_and_then(rng, 0.25, 0.2),
+        coma=_sometimes_zero(rng, 0.25, 0.2),
         coma_deg=float(rng.uniform(0.0, 360.0)),
-        defocus_px=_now_and_then(rng, 0.2, 2.5),
+        defocus_px=_sometimes_zero(rng, 0.2, 2.5),
     )
 
 
@@ -130,31 +130,33 @@ def _dirt(rng: np.random.Generator) -> Dirt:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """What became of one frame: its target's errors (3,), or None if it was not measured."""
+    """Result of one frame."""
 
     number: int
     settings: SimulationSettings
+    # (3,): relative error of the distance, standardised errors of distance and centre; None: not
+    # measured
     errors: FloatArray | None
 
     @property
     def radius_px(self) -> float:
-        """About that of the target."""
+        """Approximate radius of the target's ring [px]."""
         return _OUTER_RADIUS_M * _FOCAL_PX / self.settings.distance_m[0]
 
     @property
     def is_even(self) -> bool:
-        """Whether the light is the same everywhere."""
+        """Whether the light is the same on the whole plate."""
         chosen = self.settings
         return chosen.shadow is None and chosen.dirt is None and chosen.glare is None
 
     @property
     def worst(self) -> float:
-        """Larger one of both standardised errors."""
+        """The larger of both standardised errors."""
         return 0.0 if self.errors is None else float(np.abs(self.errors[1:]).max())
 
 
 def _outcome(number: int) -> Outcome:
-    settings = drawn(number)
+    settings = random_settings(number)
     errors, _ = errors_in_frame(plan_flight(settings, number % _GROUNDS), 0)
     return Outcome(number, settings, errors[0] if errors else None)
 
@@ -182,7 +184,7 @@ _LINES: dict[str, Callable[[Outcome], bool]] = {
 
 
 def lines_of(outcomes: Sequence[Outcome]) -> Iterable[str]:
-    """Return the lines of the table, and the worst frames."""
+    """Return the lines of the table, followed by the worst frames."""
     for name, belongs in _LINES.items():
         chosen = [each for each in outcomes if belongs(each)]
         errors = [each.errors for each in chosen if each.errors is not None]
@@ -198,7 +200,7 @@ def lines_of(outcomes: Sequence[Outcome]) -> Iterable[str]:
             relative, z, of_centre = each.errors.tolist()
             yield (
                 f"frame {each.number}: R {each.radius_px:.0f} px,"
-                f" distance {100.0 * relative:+.4f} %, z {z:+.1f}, of centre {of_centre:.1f}"
+                f" distance {100.0 * relative:+.4f} %, z {z:+.1f}, z of centre {of_centre:.1f}"
             )
 
 
@@ -217,7 +219,7 @@ def main(frames: int, first: int, jobs: int | None) -> None:
             start_arguments=(0,),
         )
     )
-    print("frames             found     z mean   z RMS  z of centre  > 3")
+    print("frames             found     z mean   z RMS  z of centre  > 3 (z of the distance)")
     for line in lines_of(outcomes):
         print(line)
 

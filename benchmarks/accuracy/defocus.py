@@ -1,9 +1,10 @@
-"""Flights of a camera that is out of focus: what their acceptance asks for.
+"""Flights with a camera that is out of focus: the figures by which such flights are accepted.
 
 Usage: python -m benchmarks.accuracy.defocus [--preset clean ...] [--defocus 2 ...] [--frames 40]
 
-Out of focus, a point becomes a uniform disc instead of something like a Gaussian. A line for each
-preset and radius of that disc in px, with the columns of `benchmarks.accuracy.flights`.
+Defocus spreads a point into a uniform disc, while a focused lens makes a nearly Gaussian spot.
+There is a line for each preset and radius of that disc [px], with the columns of
+`benchmarks.accuracy.flights`.
 """
 
 from __future__ import annotations
@@ -32,7 +33,12 @@ _DEFOCUS_PX = (0.0, 1.0, 1.5, 2.0, 3.0)
 @click.command()
 @click.option("--preset", "names", multiple=True, default=_PRESETS, type=click.Choice([*PRESETS]))
 @click.option(
-    "--defocus", "radii_px", multiple=True, type=float, default=_DEFOCUS_PX, help="In px."
+    "--defocus",
+    "radii_px",
+    multiple=True,
+    type=float,
+    default=_DEFOCUS_PX,
+    help="Radius of the disc into which defocus spreads a point [px].",
 )
 @click.option("--frames", type=click.IntRange(2), default=40, show_default=True)
 @click.option("--seed", type=click.IntRange(min=0), default=5, show_default=True)

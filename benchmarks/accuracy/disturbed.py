@@ -1,17 +1,18 @@
-"""How near a flight in real light comes to the bound of its frames, and what so few frames tell.
+"""Errors of a flight in realistic light, compared with the bound of its frames and with chance.
 
 Usage: python -m benchmarks.accuracy.disturbed FLIGHT TRUTH [--levels 0.006 0.03] [--skew]
            [--jpeg 93]
 
 For every measured frame, the Cramér-Rao bound (`kgcp.simulation.crlb`) is computed for the camera
-of the simulators, twice: with the unknowns of even light alone, and with those of light, lens and
-processing that a flight disturbs, see `disturbances`. The blur is the one that was measured. Noise
-is the sensor's and, with --jpeg, the compression's. Shade and stains, which leave less light, and
-what noise reduction leaves are not in it: it is a bound still, but for frames better than these.
+of the simulators, twice: with the unknowns of even light alone, and with additional unknowns for
+the disturbances of light, lens and processing, see `disturbances`. The blur is the measured one.
+The noise is that of the sensor and, with --jpeg, of the compression. The bound does not allow for
+the loss of light by shade and stains, or for noise reduction: it is still a bound, but one for
+better frames than these.
 
-Beside each band's errors stands what chance makes of them: the interval in which the RMS error of
-so few frames lies in 95 of 100 cases, if every frame's error is that of its bound; and in which
-their z lie, if sigmas are true.
+Beside the errors of each band, the table has the intervals that 95 % of sets of so few frames reach
+by chance: for the RMS error, if the error of every frame has the standard deviation of its bound;
+and for z, if the reported standard deviations are right.
 """
 
 from __future__ import annotations
@@ -44,33 +45,35 @@ from kgcp.simulation.crlb import Equations, Shot, equations_of, pose_bound, prop
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 
-_SHARPEST_PX2 = 0.09  # of point spreads, without the pixels' own
-_MASK_PX = 1.2  # of sharpening
-_STEP_PX2 = 0.02  # of smoothing along contours
-_SMOOTHING_SD_PX2 = 0.05  # of a frame's about its camera's, which the flight tells
-_KNOTS_PX, _KNOTS_PER_RADIUS = 8.0, 6.0  # of the levels: the finer limit, and knots per radius
+_SHARPEST_PX2 = 0.09  # least variance of the point spread, without that of the pixel
+_MASK_PX = 1.2  # σ of the sharpening mask
+_STEP_PX2 = 0.02  # step for the derivative by smoothing along contours
+_SMOOTHING_SD_PX2 = 0.05  # of a frame's smoothing about that of its camera, which is known
+_KNOTS_PX, _KNOTS_PER_RADIUS = 8.0, 6.0  # lattice of the levels: least spacing, knots per radius
 _DRAWS, _CHANCE = 20_000, (0.025, 0.975)
 _LEAST_FRAMES = 3
-_EXPOSURES = 8  # whose compression is looked at
-_BANDS = np.array([-0.01, 0.03, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.97, 1.01])  # share of white
+_EXPOSURES = 8  # noisy frames from which the effect of compression is estimated
+# limits of classes of pixels by their share of white
+_BANDS = np.array([-0.01, 0.03, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.97, 1.01])
 
 
 @dataclass(frozen=True, slots=True)
 class Disturbance:
-    """What a flight disturbs beyond even light."""
+    """Disturbances of a flight that the bound treats as unknown."""
 
-    # of the levels of ink and of plate from place to place, of the contrast; 0: they are even
+    # standard deviations of the levels of ink and of plate from place to place, relative to the
+    # contrast; 0: they are even
     levels_sd: tuple[float, float]
-    has_skew: bool  # whether the point spread may be skew
+    has_skew: bool  # whether the point spread may be asymmetric
     jpeg_quality: int | None  # None: frames are not compressed
 
 
 def disturbances(equations: Equations, *, has_skew: bool) -> Iterator[FloatArray]:
-    """Yield the derivatives (height, width) of the irradiance by what may be disturbed.
+    """Yield the derivatives (height, width) of the irradiance by the unknown disturbances.
 
-    By the third parameter of the tone, elongations of the point spread, gradient of the light,
-    sharpening behind and before the tone curve, and the third cumulants of the point spread. None
-    has a prior, so that their scales do not matter.
+    These are the third parameter of the tone curve, elongations of the point spread, the gradient
+    of the light, sharpening after and before the tone curve, and the third cumulants of the point
+    spread. None has a prior, so that their scales do not matter.
     """
     share, view = equations.share, equations.view
     shot = view.shot
@@ -96,7 +99,7 @@ def disturbances(equations: Equations, *, has_skew: bool) -> Iterator[FloatArray
 def by_smoothing(equations: Equations) -> FloatArray:
     """Return the derivative (height, width) of the white share by smoothing along contours [px²].
 
-    A circle of r pixels shrinks by half a pixel over r.
+    A circle with a radius of r px shrinks by 1 / (2 r) px.
     """
     shot = equations.view.shot
     ring = shot.plate.target.ring
@@ -127,7 +130,8 @@ def _px_per_m(shot: Shot) -> float:
 def levels_of(equations: Equations, levels_sd: tuple[float, float]) -> csc_array:
     """Return the derivatives (n, k) by the levels of ink and plate at the knots of a lattice.
 
-    In units of their deviations, and of the contrast; between knots, levels are bilinear.
+    The levels are in units of their standard deviations times the contrast; between knots, they are
+    interpolated bilinearly.
     """
     share, shot = equations.share, equations.view.shot
     radius_px = 0.5 * shot.plate.target.ring.outer_diameter_m * _px_per_m(shot)
@@ -154,9 +158,10 @@ def levels_of(equations: Equations, levels_sd: tuple[float, float]) -> csc_array
 
 
 def weight_left(equations: Equations, quality: int) -> FloatArray:
-    """Return how much less (n,) a pixel weighs because of JPEG, from frames with noise.
+    """Return the factors (n,) by which JPEG reduces the weights of pixels, from noisy frames.
 
-    The mean square of what it changes goes with the share of white: edges suffer most.
+    They follow from the mean square change by compression, by the pixels' share of white: pixels at
+    edges change most.
     """
     share, shot = equations.share, equations.view.shot
     rng, light = np.random.default_rng(1), equations.view.irradiance(share)
@@ -173,7 +178,7 @@ def weight_left(equations: Equations, quality: int) -> FloatArray:
 
 
 def disturbed_bound(shot: Shot, disturbance: Disturbance) -> tuple[float, float]:
-    """Return the bounds of the distance [%] in even light and of the disturbed frame.
+    """Return the bounds of the distance [%]: in even light, and with the disturbances.
 
     The levels, which have a prior, are eliminated: N = Xᵀ X − Xᵀ L (Lᵀ L + 1)⁻¹ Lᵀ X.
     """
@@ -208,7 +213,7 @@ def disturbed_bound(shot: Shot, disturbance: Disturbance) -> tuple[float, float]
 
 
 def shot_of(camera: Camera, row: pd.Series) -> Shot:
-    """Return the view of the simulators' target that a row of truth and measurement describes."""
+    """Return the view of the simulator's target, from a joined row of truth and measurement."""
     elements = [f"r{i}{k}" for i in range(3) for k in range(3)]
     rotation = row[elements].to_numpy(float).reshape(3, 3)
     is_linear = camera.response is Response.LINEAR
@@ -228,18 +233,18 @@ def _bounds_in_worker(task: tuple[Shot, Disturbance]) -> tuple[float, float]:
 
 
 def chance_of_rms(deviations: FloatArray) -> FloatArray:
-    """Return the interval (2,) in which the RMS of errors of these deviations lies in 95 %."""
+    """Return the 95 % interval (2,) of the RMS of errors with these standard deviations."""
     errors = np.random.default_rng(1).standard_normal((_DRAWS, len(deviations))) * deviations
     return np.asarray(np.quantile(np.sqrt(np.mean(errors**2, axis=1)), _CHANCE))
 
 
 def chance_of_z(count: int) -> FloatArray:
-    """Return the interval (2,) in which the RMS of standardised errors lies in 95 %."""
+    """Return the 95 % interval (2,) of the RMS of a number of standardised errors."""
     return np.asarray(np.sqrt(chi2.ppf(_CHANCE, count) / count))
 
 
 def lines(table: pd.DataFrame) -> Iterator[str]:
-    """Yield a line of titles and one for each band that has some frames, and one for all."""
+    """Yield a header, a line for each band that has some frames, and one for all frames."""
     yield (
         "      R px  frames  error %   bound %: even  disturbed (RMS by chance)"
         "   / bound  z distance (by chance)  z centre (by chance)"
@@ -272,10 +277,12 @@ def _rms(values: pd.Series | FloatArray) -> float:
     type=click.FloatRange(0.0, 1.0),
     nargs=2,
     default=(0.0, 0.0),
-    help="Deviations of ink and plate from place to place, of the contrast; 0: they are even.",
+    help="Standard deviations of the levels of ink and plate, relative to the contrast; 0: even.",
 )
-@click.option("--skew", is_flag=True, help="The point spread may be skew.")
-@click.option("--jpeg", type=click.IntRange(1, 100), default=None, help="Quality of the frames.")
+@click.option("--skew", is_flag=True, help="The point spread may be asymmetric.")
+@click.option(
+    "--jpeg", type=click.IntRange(1, 100), default=None, help="JPEG quality of the frames."
+)
 @click.option("--jobs", type=click.IntRange(1, 256), default=None)
 def main(
     flight: Path,

@@ -1,9 +1,9 @@
-"""Compare what kgcp finds in a flight with the truth: found, present, wrong, errors by radius.
+"""Compare the measurements of a flight with the truth: detection and errors by ring radius.
 
 Usage: python -m benchmarks.accuracy.evaluate FLIGHT TRUTH [--method paper] [--jobs 2]
 
-TRUTH is the truth.csv of a simulated flight. A target is wrong if it is reported where there is
-none, or with a centre more than max(3 px, R/2) away from the true one.
+TRUTH is the truth.csv of a simulated flight. A measurement is wrong if there is no target, or if
+its centre is more than max(3 px, R/2) away from the true one.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from kgcp.settings import DetectSettings, Method
 
 
 def detect(flight_folder: Path, settings: DetectSettings, jobs: int) -> pd.DataFrame:
-    """Run the detector over a flight, in a folder that is thrown away, and return its table."""
+    """Run the detector on a flight, with a temporary folder of results, and return its table."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
         flight = read_flight(flight_folder)

@@ -1,13 +1,13 @@
-"""One line for each of several simulated flights: what their acceptance asks for.
+"""One line for each of several simulated flights: the figures by which they are accepted.
 
 Usage: python -m benchmarks.accuracy.flights FLIGHT... [--jobs 2]
 
-The truth.csv of a flight lies in its folder or beside it. Columns: found and present; RMS error of
-the distance of rings of R ≥ 26 px and of 13–26 px; its mean with two standard errors of R ≥ 26 px
-[%]; RMS of error over reported standard deviation of distance and centre; share of distances that
-are off by more than three of them; median squared Mahalanobis distance of the pose; and how many
-normals are on the wrong side, of those whose sides differ by more than three standard deviations of
-what attitudes say about them.
+The truth.csv of a flight is in its folder or beside it. Columns: targets found and present; RMS
+error of the distance for rings of R ≥ 26 px and of 13–26 px [%]; mean error with two standard
+errors for R ≥ 26 px [%]; RMS of the errors divided by their reported standard deviations, of
+distance and centre; share of distances that are off by more than three standard deviations; median
+squared Mahalanobis distance of the pose; and the number of normals on the wrong side, among those
+whose two sides are more than three standard deviations apart by the known attitudes.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ _SIGMAS = 3.0
 
 
 def truth_path(flight: Path) -> Path:
-    """Return the truth.csv of a flight, which lies in its folder or beside it."""
+    """Return the truth.csv of a flight, which is in its folder or beside it."""
     within = flight / "truth.csv"
     return within if within.exists() else flight.parent / "truth.csv"
 
 
 def sides_told_apart(flight: Flight, right: pd.DataFrame) -> pd.Series:
-    """Return whether the two normals of measured targets differ by more than what is known allows.
+    """Return whether the known attitudes tell the two possible normals of measured targets apart.
 
-    Mirrored about the viewing ray, they are twice the tilt apart. Where nothing is known, they do
-    not.
+    The normals are mirrored about the viewing ray, so that twice the tilt lies between them. If no
+    attitudes are known, they cannot be told apart.
     """
     frames = list(right["frame"])
     priors = priors_of_frames(flight, FlightData(flight, frames), frames)
@@ -56,7 +56,7 @@ def sides_told_apart(flight: Flight, right: pd.DataFrame) -> pd.Series:
 
 
 def line_of(name: str, flight: Flight, table: pd.DataFrame) -> str:
-    """Return the line of one flight, of which `table` is that of `join_truth`."""
+    """Return the line of one flight; `table` is the result of `join_truth`."""
     large, middle, *_ = summarise(table)
     right = table[table["is_right"]]
     told = right[sides_told_apart(flight, right)]

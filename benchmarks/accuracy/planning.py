@@ -1,4 +1,4 @@
-"""Measure what `kgcp plan` takes as given: how often rings are found, and scatter over bound.
+"""Measure the figures that `kgcp plan` uses: detection rates, and ratios of errors to bounds.
 
 Usage: python -m benchmarks.accuracy.planning [--frames 150] [--flights 12] [--seed 1] [--jobs 2]
                                      [--keep DIR]
@@ -23,12 +23,12 @@ from benchmarks.search.sets import SETS_BY_NAME
 from kgcp.pipeline.execution.resilient_map import usable_cores
 from kgcp.settings import DetectSettings
 
-_SETS = ("small", "middle", "large")  # of one plate each
+_SETS = ("small", "middle", "large")  # sets whose frames show one plate each
 _RADII_PX = (6.0, 7.0, 8.0, 9.0, 13.0, 26.0, 60.0, 150.0, 1e4)
 
 
 def found_by_radius(frames: int, seed: int, jobs: int) -> Iterator[tuple[float, float, int, int]]:
-    """Yield bands of ring radius with how many plates were found in them, and how many shown."""
+    """Yield bands of ring radius, with the numbers of plates that were found and shown in them."""
     radii_px: list[float] = []
     found: list[bool] = []
     for name in _SETS:
@@ -46,7 +46,7 @@ def found_by_radius(frames: int, seed: int, jobs: int) -> Iterator[tuple[float, 
 def scatter_over_bound(
     names: tuple[str, ...], frames: int, seed: int, jobs: int, keep: Path
 ) -> tuple[float, float, int]:
-    """Return RMS of error over bound, of distance and centre, and of how many targets."""
+    """Return the RMS of error over bound, of distance and centre, and the number of targets."""
     tables = []
     for name in names:
         plan = plan_preset(name, frames, seed)
@@ -62,14 +62,18 @@ def scatter_over_bound(
 
 
 @click.command()
-@click.option("--frames", type=click.IntRange(1), default=150, show_default=True, help="Per set.")
+@click.option(
+    "--frames", type=click.IntRange(1), default=150, show_default=True, help="Frames per set."
+)
 @click.option("--flights", type=click.IntRange(2), default=12, show_default=True,
               help="Frames per simulated flight.")  # fmt: skip
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
 @click.option("--jobs", type=click.IntRange(1, 256), default=None)
-@click.option("--keep", type=click.Path(path_type=Path), required=True, help="Of the flights.")
+@click.option(
+    "--keep", type=click.Path(path_type=Path), required=True, help="Folder of the flights."
+)
 def main(frames: int, flights: int, seed: int, jobs: int | None, keep: Path) -> None:
-    """Print both."""
+    """Print the ratios and the detection rates."""
     cores = jobs or usable_cores()
     linear = tuple(name for name in PRESET_NAMES if name != "consumer")
     for names in (linear, ("consumer",)):

@@ -40,7 +40,7 @@ def plan_preset(name: str, frames: int, seed: int) -> FlightPlan:
 
 
 def simulate(plan: FlightPlan, keep: Path, jobs: int) -> Path:
-    """Return the folder of the plan's flight within `keep`, rendered if it is not there yet."""
+    """Return the folder of the plan's flight in `keep`; render the flight if it is missing."""
     folder = keep / f"{plan.settings.name}_{plan.settings.frames}_{plan.seed}"
     if not (folder / "truth.csv").is_file():
         keep.mkdir(parents=True, exist_ok=True)
@@ -57,7 +57,7 @@ def compare(plan: FlightPlan, folder: Path, settings: DetectSettings, jobs: int)
 
 
 def bounds_of(settings: SimulationSettings, frames: list[FramePlan], jobs: int) -> pd.DataFrame:
-    """Return the bound of each of the frames, which show the target."""
+    """Return the bounds of frames, all of which show the target."""
     bounds = ordered_map(
         _bound_in_worker,
         [(settings, frame) for frame in frames],
@@ -87,7 +87,7 @@ def _folder_or_temporary(keep: Path | None) -> Iterator[Path]:
 
 @click.command()
 @click.option("--preset", "names", multiple=True, type=click.Choice(tuple(PRESETS)))
-@click.option("--frames", type=click.IntRange(2), default=None, help="Per preset.")
+@click.option("--frames", type=click.IntRange(2), default=None, help="Frames per preset.")
 @click.option("--quick", is_flag=True, help=f"{_QUICK_FRAMES} frames per preset.")
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
 @click.option("--jobs", type=click.IntRange(1, 256), default=None)
@@ -95,7 +95,7 @@ def _folder_or_temporary(keep: Path | None) -> Iterator[Path]:
     "--keep",
     type=click.Path(path_type=Path),
     default=None,
-    help="Folder in which the flights stay and are found again.",
+    help="Folder that keeps the simulated flights, to reuse them the next time.",
 )
 @click.option(
     "--method", type=click.Choice([m.value for m in Method]), default=DetectSettings().method.value

@@ -1,10 +1,10 @@
-"""Flights whose frames went through processing that the image model does not know.
+"""Flights with frames after processing that the image model does not know.
 
 Usage: python -m benchmarks.accuracy.processed FLIGHT... [--only median] [--jobs 2]
 
-Every processing is applied to the frames of a flight, whose response is then declared unknown. The
-lines are those of `benchmarks.accuracy.flights`. They show whether deviations stay true, and
-whether what cannot be measured is rejected.
+Each kind of processing is applied to the frames of a flight, and their response is then declared
+unknown. The lines are those of `benchmarks.accuracy.flights`. They show whether the reported
+standard deviations remain right, and whether targets that cannot be measured are rejected.
 """
 
 from __future__ import annotations
@@ -29,41 +29,41 @@ from kgcp.pipeline.execution.resilient_map import usable_cores
 from kgcp.settings import DetectSettings
 
 Pixels = npt.NDArray[np.uint8]  # (rows, columns) or (rows, columns, 3)
-_COMPRESSIONS = {"JPEG 70": 70, "JPEG 40": 40}  # their quality
-_QUALITY = 95  # of other JPEGs
-_SPOILT_SHARE, _SEED = 0.001, 3  # of the pixels
+_COMPRESSIONS = {"JPEG 70": 70, "JPEG 40": 40}  # name → quality
+_QUALITY = 95  # of the JPEGs of other processings
+_STUCK_SHARE, _SEED = 0.001, 3  # share of stuck pixels
 
 
 def _rounded(values: npt.NDArray[np.floating]) -> Pixels:
     return np.asarray(np.clip(np.rint(values), 0.0, 255.0), np.uint8)
 
 
-def _spoilt(pixels: Pixels, value: int) -> Pixels:
+def _with_stuck_pixels(pixels: Pixels, value: int) -> Pixels:
     """Return the frame with a thousandth of its pixels stuck at a value."""
     changed = pixels.copy()
-    changed[np.random.default_rng(_SEED).random(pixels.shape[:2]) < _SPOILT_SHARE] = value
+    changed[np.random.default_rng(_SEED).random(pixels.shape[:2]) < _STUCK_SHARE] = value
     return changed
 
 
 def _for_colours(pixels: Pixels, values: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-    """Return values of rows (rows, 1) or of columns (1, columns) that apply to all colours."""
+    """Return values of rows (rows, 1) or columns (1, columns), broadcastable to all colours."""
     return values[..., None] if pixels.ndim > values.ndim else values
 
 
-def _banded(pixels: Pixels) -> Pixels:
-    """Return the frame as a rolling shutter sees a lamp that flickers: ± 2 % in 44 rows."""
+def _with_flicker(pixels: Pixels) -> Pixels:
+    """Return the frame with the bands of a flickering lamp: ± 2 % with a period of 44 rows."""
     flicker = 1.0 + 0.02 * np.sin(np.arange(len(pixels))[:, None] / 7.0)
     return _rounded(pixels * _for_colours(pixels, flicker))
 
 
-def _noisy_columns(pixels: Pixels) -> Pixels:
-    """Return the frame with an offset of each column, σ 2 grey values."""
+def _with_column_noise(pixels: Pixels) -> Pixels:
+    """Return the frame with a random offset of each column, σ = 2 grey values."""
     offsets = np.random.default_rng(_SEED).normal(0.0, 2.0, (1, pixels.shape[1]))
     return _rounded(pixels + _for_colours(pixels, offsets))
 
 
 def _enlarged(pixels: Pixels) -> Pixels:
-    """Return the frame reduced to half its size, and enlarged to its size again."""
+    """Return the frame after reduction to half its size and enlargement to its original size."""
     height, width = pixels.shape[:2]
     half = cv2.resize(pixels, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
     return np.asarray(cv2.resize(half, (width, height), interpolation=cv2.INTER_CUBIC), np.uint8)
@@ -76,8 +76,8 @@ def _contrast_by_tiles(pixels: Pixels) -> Pixels:
     return np.asarray(np.stack(layers).T.reshape(pixels.shape), np.uint8)
 
 
-def _less_blurred(pixels: Pixels, sigma_px: float, strength: float) -> Pixels:
-    """Return the frame with so much of what a Gaussian blur takes away added to it."""
+def _with_unsharp_mask(pixels: Pixels, sigma_px: float, strength: float) -> Pixels:
+    """Return the frame with an unsharp mask: `strength` times its difference to a blurred copy."""
     blurred = cv2.GaussianBlur(pixels.astype(np.float32), (0, 0), sigma_px)
     return _rounded(pixels + strength * (pixels - blurred))
 
@@ -91,23 +91,25 @@ def _interlaced(pixels: Pixels) -> Pixels:
 
 PROCESSINGS: Mapping[str, Callable[[Pixels], Pixels]] = {
     "as it is": lambda pixels: pixels,
-    "hot pixels": lambda pixels: _spoilt(pixels, 255),
-    "dead pixels": lambda pixels: _spoilt(pixels, 0),
-    "flicker": _banded,
-    "column noise": _noisy_columns,
+    "hot pixels": lambda pixels: _with_stuck_pixels(pixels, 255),
+    "dead pixels": lambda pixels: _with_stuck_pixels(pixels, 0),
+    "flicker": _with_flicker,
+    "column noise": _with_column_noise,
     "32 grey values": lambda pixels: _rounded(8.0 * np.rint(pixels / 8.0)),
     "haze": lambda pixels: _rounded(0.3 * pixels + 120.0),
     "gamma": lambda pixels: _rounded(255.0 * np.sqrt(pixels / 255.0)),
     "median": lambda pixels: np.asarray(cv2.medianBlur(pixels, 3), np.uint8),
     "bilateral": lambda pixels: np.asarray(cv2.bilateralFilter(pixels, 7, 25.0, 3.0), np.uint8),
     "enlarged": _enlarged,
-    "sharpened": lambda pixels: _less_blurred(pixels, 2.0, 1.5),
-    "local contrast": lambda pixels: _less_blurred(pixels, 15.0, 0.5),
+    "sharpened": lambda pixels: _with_unsharp_mask(pixels, 2.0, 1.5),
+    "local contrast": lambda pixels: _with_unsharp_mask(pixels, 15.0, 0.5),
     "CLAHE": _contrast_by_tiles,
     **dict.fromkeys(_COMPRESSIONS, lambda pixels: pixels),
     "interlaced": _interlaced,
 }
-"""What becomes of the pixels of a frame, by name; they are compressed when it is written."""
+"""Functions of the pixels of a frame, by the name of the processing.
+
+Compression takes place when the frame is written."""
 
 
 def process_flight(flight: Path, name: str, out: Path) -> None:
@@ -122,7 +124,7 @@ def process_flight(flight: Path, name: str, out: Path) -> None:
     for frame in list_frames(frames):
         pixels = cv2.imread(str(frames / frame), cv2.IMREAD_UNCHANGED)
         if pixels is None or pixels.dtype != np.uint8:
-            raise click.UsageError(f"{frames / frame}: is no frame of 8 bits")
+            raise click.UsageError(f"{frames / frame}: does not have 8 bits")
         is_jpeg = name in _COMPRESSIONS or Path(frame).suffix.lower() in {".jpg", ".jpeg"}
         _, encoded = cv2.imencode(
             ".jpg" if is_jpeg else ".png",

@@ -1,15 +1,16 @@
-"""Rings of one size at a time, in even and uneven light.
+"""Errors of rings of one range of sizes, in even and uneven light.
 
 Usage: python -m benchmarks.accuracy.ring_sizes [--size small] [--frames 60] [--quality 85]
 
-Small rings have radii of 7 to 13 px and show little of ink and plate beside their edges; middle
-ones have 37 to 140 px; large ones have 150 to 290 px and are seen in bins, or in some of their
-pixels. Each line is a camera and a kind of light: how many of the targets are measured, the RMS
-error of the distance, its mean and RMS standardised, how many are off by more than three standard
-deviations, the RMS standardised error of the centre, and the median CPU time of a frame. The
-cameras are those of presets of `kgcp simulate`, and `srgb`, that of `clean` with sRGB's curve,
-which is stated. With `--quality`, frames are compressed as JPEG; `--astigmatism`, `--coma` and
-`--defocus` are those of `kgcp simulate`.
+Small rings have radii of 7 to 13 px, so that hardly any pixels of ink and plate are away from
+edges. Middle ones have radii of 37 to 140 px. Large ones have radii of 150 to 290 px; kgcp measures
+them in binned pixels, or in some of their pixels. Each line is for a camera and a kind of light:
+number of targets measured, RMS error of the distance [%], mean and RMS of its standardised error,
+number of distances that are off by more than three standard deviations, RMS standardised error of
+the centre, and median CPU time of a frame [ms]. The cameras are those of presets of `kgcp
+simulate`, and `srgb`, which is the camera of `clean` with a stated sRGB curve. With `--quality`,
+frames are compressed as JPEG; `--astigmatism`, `--coma` and `--defocus` are those of `kgcp
+simulate`.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ _LIGHTS: dict[str, dict[str, object]] = {
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """How large rings are."""
+    """Range of distances for a range of ring sizes, and the frame to render."""
 
     distance_m: tuple[float, float]
     frame_px: tuple[int, int]
@@ -88,7 +89,7 @@ SIZES = {
 def settings_of(
     camera: str, light: str, frames: int, size: Size = SIZES["small"], quality: int | None = None
 ) -> SimulationSettings:
-    """Return a flight of frames that are not much larger than the target in each of them."""
+    """Return the settings of a flight with frames that are not much larger than the target."""
     chosen = _CAMERAS[camera]
     (width, height), (cx, cy) = size.frame_px, size.principal_point_px
     return replace(
@@ -99,27 +100,28 @@ def settings_of(
         distance_m=size.distance_m,
         jpeg_quality=quality,
         camera=replace(chosen.camera, width=width, height=height, cx=cx, cy=cy),
-        **_LIGHTS[light],  # type: ignore[arg-type] # of the settings' own names
+        **_LIGHTS[light],  # type: ignore[arg-type] # names of settings
     )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RingErrors:
-    """Errors of the targets that are measured (n,), and what a frame costs."""
+    """Errors of the measured targets (n,), and the CPU time of a frame."""
 
-    relative: FloatArray  # of the distance
-    distance: FloatArray  # the same, in standard deviations
-    centre: FloatArray  # per axis, in standard deviations
-    seconds: float  # CPU time of a frame, median
+    relative: FloatArray  # relative errors of the distance
+    distance: FloatArray  # the same errors divided by their standard deviations
+    centre: FloatArray  # errors of the centre per axis, divided by their standard deviations
+    seconds: float  # median CPU time of a frame
 
 
 _ground_of = cache(grow_ground)  # once per process
 
 
 def errors_in_frame(plan: FlightPlan, index: int) -> tuple[list[FloatArray], float]:
-    """Return relative and standardised errors (3,) of each measured target, and the CPU time [s].
+    """Return three errors (3,) of each measured target, and the CPU time [s].
 
-    They are of the distance, relative and standardised, and of the centre, standardised.
+    The errors are those of the distance, relative and standardised, and of the centre,
+    standardised.
     """
     frame, camera = plan.frames[index], plan.settings.camera
     rendered = render_frame(plan, _ground_of(plan.seed), index)
@@ -142,7 +144,7 @@ def errors_in_frame(plan: FlightPlan, index: int) -> tuple[list[FloatArray], flo
 
 
 def errors_of(settings: SimulationSettings, seed: int, jobs: int = 1) -> RingErrors:
-    """Return the errors in a flight."""
+    """Return the errors of all frames of a flight."""
     found = list(
         ordered_map(
             partial(errors_in_frame, plan_flight(settings, seed)),
@@ -167,13 +169,19 @@ def errors_of(settings: SimulationSettings, seed: int, jobs: int = 1) -> RingErr
     multiple=True,
     default=("clean", "consumer"),
     show_default=True,
-    help="One or more.",
+    help="One or more cameras.",
 )
-@click.option("--frames", type=click.IntRange(2), default=60, show_default=True, help="Per line.")
-@click.option("--quality", type=click.IntRange(1, 100), default=None, help="Of JPEG.")
-@click.option("--astigmatism", type=click.FloatRange(1.0, 5.0), default=1.0, help="Of the lens.")
-@click.option("--coma", type=click.FloatRange(0.0, 0.2), default=0.0, help="Of the lens.")
-@click.option("--defocus", type=click.FloatRange(0.0, 10.0), default=0.0, help="Of the lens [px].")
+@click.option(
+    "--frames", type=click.IntRange(2), default=60, show_default=True, help="Frames per line."
+)
+@click.option("--quality", type=click.IntRange(1, 100), default=None, help="Quality of JPEG.")
+@click.option(
+    "--astigmatism", type=click.FloatRange(1.0, 5.0), default=1.0, help="As kgcp simulate."
+)
+@click.option("--coma", type=click.FloatRange(0.0, 0.2), default=0.0, help="As kgcp simulate.")
+@click.option(
+    "--defocus", type=click.FloatRange(0.0, 10.0), default=0.0, help="As kgcp simulate [px]."
+)
 @click.option("--seed", type=click.IntRange(0), default=77, show_default=True)
 @click.option("--jobs", type=click.IntRange(1, 256), default=None)
 def main(
@@ -191,7 +199,7 @@ def main(
     aberration = Aberration(astigmatism=astigmatism, coma=coma, defocus_px=defocus)
     lens = None if aberration == Aberration() else aberration
     print(
-        "camera       light                found  error [%] z mean   z RMS  > 3  z of centre   ms"
+        "camera       light                found  RMS [%]   z mean   z RMS  > 3  z of centre   ms"
     )
     for camera in cameras:
         for light in _LIGHTS:

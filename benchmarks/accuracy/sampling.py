@@ -1,12 +1,13 @@
-"""What a renderer that samples a plate at few points per pixel does to the distances measured.
+"""Errors of distances that are caused by a renderer with few samples per pixel.
 
 Usage: python -m benchmarks.accuracy.sampling FLIGHT TRUTH [--samples 4] [--jobs 2]
 
-Every frame's plate is drawn again where TRUTH has it, sampled n × n times per pixel, with linear
-response and hardly any noise, and measured. That error is the renderer's. It is subtracted from the
-error in the frame: what is left is the measurement's. z is the RMS of either over the reported
-standard deviations, which know nothing of the renderer; and of the error as measured over these
-deviations together with the RMS of what the renderings of the band are off.
+The plate of every frame is rendered again at its true pose, sampled n × n times per pixel, with
+linear response and hardly any noise, and measured. The resulting error is that of the renderer. The
+error in the frame minus this error is that of the measurement. The table has three kinds of z: of
+the errors as measured and of the differences, both divided by the reported standard deviations,
+which do not include the renderer; and of the errors as measured, divided by standard deviations
+that include the RMS error of the renderings in the same band.
 """
 
 from __future__ import annotations
@@ -34,14 +35,14 @@ from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
 
 _BLACK, _WHITE = 10.0, 190.0  # grey values
-_NOISE = 1.0  # standard deviation [grey values]: less than one, and rounding has a pattern
+_NOISE = 1.0  # standard deviation [grey values]; with less, rounding would cause a pattern
 _REPEATS = 4
-_MARGIN = 1.5  # of the ring's radius
+_MARGIN = 1.5  # half the width of the rendered window, in radii of the ring
 _BAND_LIMITS_PX = sorted({limit for band in RADIUS_BANDS_PX for limit in band})
 
 
 def sampled_error(camera: Camera, target: Target, row: pd.Series, samples: int) -> float:
-    """Return the mean error of distance [%] in renderings of a frame's plate; NaN if not found."""
+    """Return the mean error of the distance [%] in renderings of a plate; NaN if not found."""
     elements = [f"r{i}{k}" for i in range(3) for k in range(3)]
     pose = Pose(
         row[elements].to_numpy(float).reshape(3, 3), row[["cx", "cy", "cz"]].to_numpy(float)
@@ -63,7 +64,10 @@ def sampled_error(camera: Camera, target: Target, row: pd.Series, samples: int) 
 def rendered(
     camera: Camera, target: Target, pose: Pose, row: pd.Series, samples: int
 ) -> tuple[int, int, FloatArray]:
-    """Sample a plate, blur it by the frame's PSF and average it over pixels; with its corner."""
+    """Return the first column and row of a window, and its pixels with the plate.
+
+    The plate is sampled, blurred with the frame's PSF, and averaged over each pixel.
+    """
     half = int(_MARGIN * row["radius_px_true"]) + 6
     low = np.maximum(np.rint([row["x"], row["y"]]).astype(int) - half, 0)
     high = np.minimum(low + 2 * half + 1, (camera.width, camera.height))
@@ -87,7 +91,7 @@ def rendered(
 
 
 def lines(table: pd.DataFrame) -> Iterator[str]:
-    """Yield means, RMS and z of every band: measured, of the renderings, of the difference."""
+    """Yield mean, RMS and z for every band: of measured errors, renderings and differences."""
     yield (
         "      R px  frames   measured: mean, RMS %   rendering: mean, RMS %   left: mean, RMS %"
         "          z: measured  left  with renderer"
