@@ -59,8 +59,8 @@ def line_of(name: str, flight: Flight, table: pd.DataFrame) -> str:
     """Return the line of one flight; `table` is the result of `join_truth`."""
     large, middle, *_ = summarise(table)
     right = table[table["is_right"]]
-    told = right[sides_told_apart(flight, right)]
-    wrong = int((told["on_right_side"] == 0.0).sum())
+    distinct = right[sides_told_apart(flight, right)]
+    wrong = int((distinct["on_right_side"] == 0.0).sum())
     z, centre = (
         float(np.sqrt(np.mean(np.square(right[each].astype(float)))))
         for each in ("z_distance", "z_centre")
@@ -70,7 +70,7 @@ def line_of(name: str, flight: Flight, table: pd.DataFrame) -> str:
         f" {large.rms_percent:8.4f} {middle.rms_percent:8.4f}"
         f"  {large.mean_percent:+.4f} ± {large.mean_2se_percent:.4f}"
         f" {z:7.2f} {centre:7.2f} {100.0 * (right['z_distance'].abs() > _SIGMAS).mean():6.1f} %"
-        f" {right['mahalanobis2'].median():7.2f} {wrong:4d}/{len(told)}"
+        f" {right['mahalanobis2'].median():7.2f} {wrong:4d}/{len(distinct)}"
     )
 
 

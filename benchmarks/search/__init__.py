@@ -1,1 +1,1 @@
-"""Frames that are hard to search, and photographs that show no target."""
+"""The search for rings: on frames that are hard to search, and on photographs without a target."""

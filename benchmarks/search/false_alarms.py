@@ -1,10 +1,11 @@
-"""Look for targets in photographs that show none: crops, mirrored, turned, scaled, re-exposed.
+"""Search for targets in photographs that show none, and in altered crops of them.
 
 Usage: python -m benchmarks.search.false_alarms FOLDER [--variants 210] [--jobs 2]
        python -m benchmarks.search.false_alarms FOLDER --photo NAME --variant 17 [--save
        picture.png]
 
-Variant 0 is the photograph as it is.
+Variant 0 is the unchanged photograph. The others are random crops that are mirrored, rotated,
+scaled and put into other light.
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ from kgcp.targets.layout import Ring, Target
 from kgcp.targets.validation import check_targets
 
 _VARIANTS = 210
-_SIDE_PX = (600, 1500)
+_SIDE_PX = (600, 1500)  # range of the sides of a crop
 _SCALE = (0.35, 2.0)  # of the crop
 _GAIN, _GAMMA, _VEIL = (0.4, 3.0), (0.6, 1.7), (0.0, 60.0)
-_FOCAL = 1.2  # of the picture's width
+_FOCAL = 1.2  # focal length, relative to the picture's width
 
 _FEW_DOTS = Ring("D", 0.4, 0.24, 0.32, 0.06, (0.0, 130.0))
 _WIDE = Ring("E", 1.2, 0.48, 0.84, 0.2, (0.0, 50.0, 100.0, 160.0, 230.0, 290.0))
@@ -47,14 +48,14 @@ check_targets(LAYOUTS)
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """What was made of one picture.
+    """Result for one picture.
 
     Attributes
     ----------
     accepted : tuple of str
-        Measurements, all of them wrong.
+        Descriptions of the measurements, all of which are wrong.
     reasons : tuple of str
-        Why the other targets were not found.
+        Reasons why the other targets were not found.
     """
 
     photo: str
@@ -72,7 +73,7 @@ def _photograph(path: Path) -> GreyArray:
 
 
 def picture(path: Path, seed: int, variant: int) -> GreyArray:
-    """Return a photograph, or some part of it in another size, direction and light."""
+    """Return a photograph (variant 0), or a random crop in another size, rotation and light."""
     grey = _photograph(path)
     if variant == 0:
         return grey
@@ -89,7 +90,7 @@ def picture(path: Path, seed: int, variant: int) -> GreyArray:
 
 
 def _reexposed(grey: GreyArray, rng: np.random.Generator) -> GreyArray:
-    """Return a picture in other light: more or less of it, another tone curve, haze."""
+    """Return a picture in random light: another exposure, tone curve and haze."""
     if rng.random() < 0.25:
         return grey
     gain, gamma = (float(np.exp(rng.uniform(*np.log(limits)))) for limits in (_GAIN, _GAMMA))
@@ -99,7 +100,7 @@ def _reexposed(grey: GreyArray, rng: np.random.Generator) -> GreyArray:
 
 
 def alarm_of(task: tuple[Path, int, int]) -> Alarm:
-    """Search one picture for all layouts: photograph, seed and variant."""
+    """Search one picture for all layouts; the task is photograph, seed and variant."""
     path, seed, variant = task
     grey = picture(path, seed, variant)
     height, width = grey.shape
@@ -127,9 +128,13 @@ def alarm_of(task: tuple[Path, int, int]) -> Alarm:
 @click.option("--variants", type=click.IntRange(1), default=_VARIANTS, show_default=True)
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
 @click.option("--jobs", type=click.IntRange(1, 256), default=None)
-@click.option("--photo", default=None, help="This one alone.")
-@click.option("--variant", type=click.IntRange(min=0), default=None, help="This one alone.")
-@click.option("--save", type=click.Path(path_type=Path), default=None, help="Where to put it.")
+@click.option("--photo", default=None, help="Search only this photograph.")
+@click.option(
+    "--variant", type=click.IntRange(min=0), default=None, help="Search only this variant."
+)
+@click.option(
+    "--save", type=click.Path(path_type=Path), default=None, help="File to save the picture to."
+)
 def main(
     folder: Path,
     variants: int,
@@ -139,9 +144,9 @@ def main(
     variant: int | None,
     save: Path | None,
 ) -> None:
-    """Print what was accepted, and why nothing else was."""
+    """Print the accepted targets, and the reasons why others were rejected."""
     if not folder.is_dir():
-        print(f"{folder}: there are no photographs; nothing was looked at")
+        print(f"{folder}: has no photographs; nothing was searched")
         return
     photos = [folder / name for name in ([photo] if photo else list_frames(folder))]
     chosen = range(variants) if variant is None else [variant]
@@ -165,7 +170,7 @@ def main(
     reasons = Counter(word for alarm in alarms for word in alarm.reasons)
     print(
         f"{len(alarms)} pictures of {len(photos)} photographs, {len(LAYOUTS)} layouts:"
-        f" {count} with something accepted, at most {wilson(count, len(alarms))[1]:.2%} (95 %)"
+        f" {count} with a false alarm, at most {wilson(count, len(alarms))[1]:.2%} (95 %)"
     )
     print(", ".join(f"{word} {number}" for word, number in reasons.most_common()))
 

@@ -40,7 +40,7 @@ _FRAMES, _QUICK_FRAMES = 300, 40
 
 
 def measured(grey: GreyArray, frame_set: FrameSet, seed: int, index: int) -> tuple[Outcome, ...]:
-    """Search a frame for all targets, of which most are absent."""
+    """Search a frame for all targets, most of which it does not show."""
     camera = frame_set.shot(seed, index).camera
     try:
         return tuple(measure_frame(grey, camera, TARGETS, DetectSettings()))
@@ -55,7 +55,7 @@ def picture(frame_set: FrameSet, seed: int, index: int) -> GreyArray:
 
 
 def verdict_of(task: tuple[str, int, int]) -> FrameVerdict:
-    """Render, measure and judge one frame: set, seed and index."""
+    """Render, measure and judge one frame; the task is set, seed and index."""
     name, seed, index = task
     frame_set = SETS_BY_NAME[name]
     grey = picture(frame_set, seed, index)
@@ -76,7 +76,7 @@ def run_set(frame_set: FrameSet, frames: int, seed: int, jobs: int) -> Iterator[
 
 
 def show_frame(frame_set: FrameSet, seed: int, index: int, save: Path | None) -> None:
-    """Print everything about one frame; write it to a file if there is one to write to."""
+    """Print everything about one frame, and write it to the file `save` if that is given."""
     shot, grey = frame_set.shot(seed, index), picture(frame_set, seed, index)
     if save is not None:
         cv2.imwrite(str(save), grey)
@@ -95,14 +95,18 @@ def show_frame(frame_set: FrameSet, seed: int, index: int, save: Path | None) ->
 
 @click.command()
 @click.option("--only", "names", multiple=True, type=click.Choice(list(SETS_BY_NAME)))
-@click.option("--frames", type=click.IntRange(1), default=None, help="Per set.")
+@click.option("--frames", type=click.IntRange(1), default=None, help="Frames per set.")
 @click.option("--quick", is_flag=True, help=f"{_QUICK_FRAMES} frames per set.")
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
 @click.option("--jobs", type=click.IntRange(1, 256), default=None)
 @click.option("--list", "most", type=click.IntRange(min=0), default=5, show_default=True,
-              help="Missed plates that are described, per set and reason.")  # fmt: skip
-@click.option("--frame", type=click.IntRange(min=0), default=None, help="This one of a set alone.")
-@click.option("--save", type=click.Path(path_type=Path), default=None, help="Where to put it.")
+              help="Number of missed plates to describe, per set and reason.")  # fmt: skip
+@click.option(
+    "--frame", type=click.IntRange(min=0), default=None, help="Show only this frame of a set."
+)
+@click.option(
+    "--save", type=click.Path(path_type=Path), default=None, help="File to save the frame to."
+)
 def main(
     names: tuple[str, ...],
     frames: int | None,
@@ -114,7 +118,7 @@ def main(
     *,
     quick: bool,
 ) -> None:
-    """Print the table, and the frames to look at."""
+    """Print the table, and the frames with failures."""
     sets = [SETS_BY_NAME[name] for name in names] or list(SETS)
     if frame is not None:
         if len(sets) != 1:
@@ -130,7 +134,9 @@ def main(
         print(table_line(frame_set, verdicts), flush=True)
         failures += failure_lines(frame_set, verdicts, most)
     print(f"{time.perf_counter() - begin_s:.0f} s")
-    print("\n".join(["set and frame, to be seen with --only SET --frame FRAME:", *failures]))
+    print(
+        "\n".join(["set and frame of failures; show one with --only SET --frame FRAME:", *failures])
+    )
 
 
 if __name__ == "__main__":

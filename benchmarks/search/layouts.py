@@ -2,9 +2,10 @@
 
 Usage: python -m benchmarks.search.layouts [--count 12] [--seed 1]
 
-Each line is a ratio of a ring's diameters; each column a number of dots, and their diameter over
-the width of the ring. The targets have random codes, radii of 12 to 70 px and tilts of up to 35
-degrees, one in each frame. kgcp's own targets have a ratio of 0.5 and 3 to 6 dots of 0.57.
+Each line is for a ratio of inner to outer diameter of the ring; each column is for a number of dots
+and for their diameter divided by the width of the ring. The targets have random codes, radii of 12
+to 70 px and tilts of up to 35 degrees, one in each frame. kgcp's own targets have a ratio of 0.5
+and 3 to 6 dots of 0.57.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from benchmarks.search.scene import (
     Veil,
     pixel_inside,
     place,
+    random_camera,
     render,
     scene_around,
-    some_camera,
     stream,
 )
 from kgcp.errors import SettingError
@@ -37,15 +38,15 @@ _DOTS = ((4, 0.35), (4, 0.57), (4, 0.75), (6, 0.35), (6, 0.57), (6, 0.75))
 _DIAMETER_M = 0.9
 _RADIUS_PX, _TILT_DEG = (12.0, 70.0), (0.0, 35.0)
 _PSF_PX, _GAIN = 0.7, 0.85
-_RIGHT = 0.02  # of the distance, how far off a right place is at most
+_MAX_ERROR = 0.02  # largest distance between measured and true place, relative to the distance
 _ATTEMPTS = 2000
-_LEAST_APART = 1.0  # dots in which a code differs from itself when it is turned
+_LEAST_APART = 1.0  # least difference of a code from itself rotated [dots]
 
 
-def some_target(
+def random_target(
     ratio: float, dots: int, dot_share: float, rng: np.random.Generator
 ) -> Target | None:
-    """Return a target of this layout with a random code; None if so many dots have no room."""
+    """Return a target of this layout with a random code; None if the dots do not fit."""
     code_m = 0.5 * (1.0 + ratio) * _DIAMETER_M
     dot_m = 0.5 * dot_share * (1.0 - ratio) * _DIAMETER_M
     for _ in range(_ATTEMPTS):
@@ -60,16 +61,16 @@ def some_target(
 
 
 def is_found(target: Target, seed: int, index: int, rng: np.random.Generator) -> bool:
-    """Render the target in a frame and tell whether it is measured where it is."""
-    camera, look = some_camera(rng)
+    """Render the target in a frame and tell whether it is measured at its true place."""
+    camera, chain = random_camera(rng)
     radius_px = float(np.exp(rng.uniform(*np.log(_RADIUS_PX))))
     pixel = pixel_inside(camera, radius_px, rng)
     seen = place(camera, plate_of(target, rng), pixel, radius_px, _TILT_DEG, rng)
     optics = Optics(_PSF_PX)
-    shot = Shot(camera, look, scene_around(seen, (), rng), (seen,), (), (), optics, _GAIN, Veil())
+    shot = Shot(camera, chain, scene_around(seen, (), rng), (seen,), (), (), optics, _GAIN, Veil())
     grey = render(shot, seed, stream(seed, "layouts", index, "pixels"))
     outcomes = examine(grey, camera, (target,), DetectSettings()).outcomes
-    limit_m = _RIGHT * seen.pose.distance_m
+    limit_m = _MAX_ERROR * seen.pose.distance_m
     return any(
         isinstance(outcome, Measurement)
         and np.linalg.norm(outcome.pose.translation_m - seen.pose.translation_m) < limit_m
@@ -78,12 +79,14 @@ def is_found(target: Target, seed: int, index: int, rng: np.random.Generator) ->
 
 
 @click.command()
-@click.option("--count", type=click.IntRange(1), default=12, show_default=True, help="Per layout.")
+@click.option(
+    "--count", type=click.IntRange(1), default=12, show_default=True, help="Frames per layout."
+)
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
 def main(count: int, seed: int) -> None:
-    """Print the share that is found."""
+    """Print the share of targets that is found for each layout."""
     cv2.setNumThreads(0)
-    print(f"found [%] of {count} by layout; -: so many dots have no room")
+    print(f"found [%] of {count} by layout; -: the dots do not fit on the ring")
     print("ratio " + "".join(f"{dots:4d} x {share:.2f}" for dots, share in _DOTS), flush=True)
     for ratio in _RATIOS:
         cells = []
@@ -91,7 +94,7 @@ def main(count: int, seed: int) -> None:
             targets = []
             for index in range(count):
                 rng = stream(seed, f"{ratio} {dots} {share}", index, "plan")
-                targets.append((some_target(ratio, dots, share, rng), index, rng))
+                targets.append((random_target(ratio, dots, share, rng), index, rng))
             if any(target is None for target, _, _ in targets):
                 cells.append(f"{'-':>11s}")
                 continue

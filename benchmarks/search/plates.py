@@ -1,4 +1,4 @@
-"""What is looked for, and what must not be taken for it: printed plates."""
+"""Printed plates: the targets to search for, and decoys that must not be taken for them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kgcp.targets.layout import Ring, Target
 from kgcp.targets.validation import check_targets, codes_coincide
 
 _CODE_A, _REPLICA_A = (0.0, 43.0, 78.0, 180.0), (10.0, 80.0, 150.0, 250.0, 290.0)
-_MIN_GAP_DEG = 30.0  # between dots of random codes: wider than a dot
+_MIN_GAP_DEG = 30.0  # between dots of random codes: more than the width of a dot
 _MOST_DOTS = 7
 _MOVED_DEG, _MOVED_LITTLE_DEG = 25.0, 10.0
 
@@ -32,12 +32,12 @@ check_targets(TARGETS)
 
 @dataclass(frozen=True, slots=True)
 class PaintedPlate(PrintedPlate):
-    """A plate that is not a coded target; `target` only says how large it is.
+    """A plate that is not a coded target; its `target` only determines its size.
 
     Attributes
     ----------
     layers : tuple of (shape, ink)
-        What is painted on the plate, in this order; ink or not.
+        Shapes on the plate in the order of painting, and whether each is ink.
     """
 
     layers: tuple[tuple[Region, bool], ...] = ()
@@ -49,7 +49,7 @@ class PaintedPlate(PrintedPlate):
 
 
 def plate_of(target: Target, rng: np.random.Generator) -> PrintedPlate:
-    """Return a target on some plate: corners, margin, ink and paint differ."""
+    """Return a target on a plate with random corners, margin, ink and paint."""
     radius_m = 0.5 * target.ring.outer_diameter_m
     outline = regular_polygon(int(rng.choice((4, 8, 24))), radius_m * rng.uniform(1.28, 1.42))
     white, black = rng.uniform(0.75, 0.9), rng.uniform(0.03, 0.09)
@@ -61,7 +61,7 @@ def _recoded(code_deg: tuple[float, ...], rng: np.random.Generator) -> PrintedPl
 
 
 def _random_code(count: int, rng: np.random.Generator) -> tuple[float, ...]:
-    """Return directions of dots that keep their distance and are not one of the targets'."""
+    """Return directions of dots that are far enough apart and not those of a target."""
     while True:
         slack = 360.0 - count * _MIN_GAP_DEG
         shares = rng.dirichlet(np.ones(count)) * slack
@@ -166,7 +166,9 @@ def _other_proportions(rng: np.random.Generator) -> PrintedPlate:
     """Print A's code on a ring of other proportions."""
     inner = float(rng.choice((0.25, 0.68)))
     middle = 0.5 * (1.0 + inner)
-    dot = min(0.5 * (1.0 - inner) * rng.uniform(0.6, 0.95), 0.29 * middle)  # within, and apart
+    dot = min(
+        0.5 * (1.0 - inner) * rng.uniform(0.6, 0.95), 0.29 * middle
+    )  # inside the ring, without touching each other
     ring = Ring("decoy", 0.9, 0.9 * inner, 0.9 * middle, 0.9 * dot, _CODE_A)
     return plate_of(Target(ring), rng)
 

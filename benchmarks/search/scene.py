@@ -22,17 +22,17 @@ from kgcp.simulation.regions import ConvexPolygon, DiscRegion
 from kgcp.simulation.scene import PlatePose, SimulatedScene, render_irradiance
 
 _ROAD_RADIUS_M = 180.0
-_AROUND_M = (100.0, 260.0)  # where on the ground the plates are, from the road's centre
+_AROUND_M = (100.0, 260.0)  # range of the distances of plates from the centre of the road's bend
 _ROOF_M, _STAND_M = 1.95, 0.05  # height of plates with and without a vehicle
-_NEAREST_VEHICLE_M = 6.0  # nearer ones are larger than the view and reach behind the camera
+_NEAREST_VEHICLE_M = 6.0  # nearer vehicles exceed the view and reach behind the camera
 _OVERSAMPLING = 4
 _ATTEMPTS = 60
-_SEPARATION = 1.6  # of the sum of two plates' radii
+_SEPARATION = 1.6  # least distance of two plates, relative to the sum of their radii
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """A kind of camera, but for its size: how light becomes a file's grey values."""
+class ImagingChain:
+    """A kind of camera: how it converts light to the grey values of a file."""
 
     name: str
     sensor: Sensor
@@ -41,10 +41,10 @@ class Look:
 
 
 _FILM = Sensor(tone=ToneCurve.FILM, sharpening=0.6, sharpening_px=1.1)
-BLUR_CLIP_PAIRS = (
-    Look("linear", Sensor(), Response.LINEAR, None),
-    Look("srgb", Sensor(tone=ToneCurve.SRGB), Response.SRGB, 95),
-    Look("consumer", _FILM, Response.UNKNOWN, 92),
+IMAGING_CHAINS = (
+    ImagingChain("linear", Sensor(), Response.LINEAR, None),
+    ImagingChain("srgb", Sensor(tone=ToneCurve.SRGB), Response.SRGB, 95),
+    ImagingChain("consumer", _FILM, Response.UNKNOWN, 92),
 )
 CAMERAS = (
     Camera(800, 600, 1182.0, 1179.0, 391.6, 307.4, -0.072, 0.055, 0.0004, -0.0003),
@@ -55,16 +55,16 @@ CAMERAS = (
 
 @dataclass(frozen=True, slots=True)
 class Obstacle:
-    """Something that lies on a plate, or its shadow.
+    """An object on a plate, or its shadow.
 
     Attributes
     ----------
     shape : DiscRegion or ConvexPolygon
-        On the plate [m].
+        Outline on the plate [m].
     pose : Pose
-        Of the plate.
+        Pose of the plate.
     radiance : float or None
-        None: textured like ground.
+        None: textured like the ground.
     """
 
     shape: DiscRegion | ConvexPolygon
@@ -75,7 +75,7 @@ class Obstacle:
 
 @dataclass(frozen=True, slots=True)
 class Veil:
-    """Haze: what is left of the scene's light, and what is scattered into the view."""
+    """Haze: share of the scene's light that remains, and light scattered into the view."""
 
     share: float = 1.0
     light: float = 0.0
@@ -83,20 +83,20 @@ class Veil:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """Everything about one frame but its noise.
+    """Everything that determines a frame, except its noise.
 
     Attributes
     ----------
     wanted : tuple of PlatePose
         Plates that should be found.
     decoys : tuple of (kind, PlatePose)
-        Plates that should not.
+        Plates that should not be found.
     gain : float
-        Exposure relative to the one at which radiance 1 fills the well.
+        Exposure, relative to that at which a radiance of 1 fills the full well.
     """
 
     camera: Camera
-    look: Look
+    chain: ImagingChain
     scene: SimulatedScene
     wanted: tuple[PlatePose, ...]
     decoys: tuple[tuple[str, PlatePose], ...]
@@ -107,13 +107,13 @@ class Shot:
 
 
 def stream(seed: int, name: str, index: int, purpose: str) -> np.random.Generator:
-    """Return the random numbers of one frame of one set."""
+    """Return a generator of random numbers for one purpose in one frame of a set."""
     key = (*name.encode(), index, *purpose.encode())
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=key)))
 
 
 def radius_px(camera: Camera, seen: PlatePose) -> float:
-    """Return the radius that the main ring has in the image, seen frontally [px]."""
+    """Return the radius of the main ring in the image as if it were seen from the front [px]."""
     ring = seen.plate.target.ring
     return 0.5 * ring.outer_diameter_m * camera.mean_focal_px / seen.pose.distance_m
 
@@ -123,14 +123,14 @@ def tilt_deg(pose: Pose) -> float:
     return math.degrees(math.acos(float(pose.normal @ pose.translation_m) / pose.distance_m))
 
 
-def some_camera(rng: np.random.Generator) -> tuple[Camera, Look]:
-    """Return one of the cameras, of one of the kinds."""
-    look = BLUR_CLIP_PAIRS[rng.integers(len(BLUR_CLIP_PAIRS))]
-    return replace(CAMERAS[rng.integers(len(CAMERAS))], response=look.response), look
+def random_camera(rng: np.random.Generator) -> tuple[Camera, ImagingChain]:
+    """Return a random camera of a random kind."""
+    chain = IMAGING_CHAINS[rng.integers(len(IMAGING_CHAINS))]
+    return replace(CAMERAS[rng.integers(len(CAMERAS))], response=chain.response), chain
 
 
 def halved(camera: Camera) -> Camera:
-    """Return a camera of half the pixels per side: plates that fill the frame cost less."""
+    """Return a camera with half the pixels per side, which saves time with very large plates."""
     width, height = camera.width // 2, camera.height // 2
     fx, fy, cx, cy = (0.5 * value for value in (camera.fx, camera.fy, camera.cx, camera.cy))
     return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
@@ -144,7 +144,7 @@ def place(
     tilt: tuple[float, float],
     rng: np.random.Generator,
 ) -> PlatePose:
-    """Put a plate in front of the camera, tilted against the viewing ray by a range of degrees."""
+    """Put a plate in front of the camera, with a random tilt against the viewing ray [deg]."""
     ray = np.append(camera.undistort(pixel), 1.0)
     ray /= np.linalg.norm(ray)
     axis = np.cross((0.0, 0.0, 1.0), ray)
@@ -160,7 +160,7 @@ def place(
 
 
 def pixel_inside(camera: Camera, ring_px: float, rng: np.random.Generator) -> FloatArray:
-    """Return a place where a ring of this radius is wholly in the frame, if there is any."""
+    """Return a pixel at which a ring of this radius is completely in the frame, if possible."""
     size = np.array([camera.width, camera.height], dtype=np.float64)
     margin = np.minimum(1.2 * ring_px + 4.0, 0.5 * size)
     pixel: FloatArray = margin + rng.random(2) * (size - 2.0 * margin) - 0.5
@@ -174,7 +174,7 @@ def place_apart(
     tilt: tuple[float, float],
     rng: np.random.Generator,
 ) -> tuple[PlatePose | None, ...]:
-    """Put plates where they do not hide each other; None if there is not enough room."""
+    """Put plates where they do not hide each other; None for plates without enough room."""
     taken: list[tuple[FloatArray, float]] = []
     placed: list[PlatePose | None] = []
     for plate in plates:
@@ -196,7 +196,7 @@ def place_apart(
 def scene_around(
     main: PlatePose, others: Sequence[PlatePose], rng: np.random.Generator
 ) -> SimulatedScene:
-    """Lay ground below a plate, half the time with a vehicle between the two."""
+    """Return a scene with ground below a plate, and in half of the cases a vehicle between them."""
     driven = main.pose.distance_m > _NEAREST_VEHICLE_M and bool(rng.random() < 0.5)
     turn = Rotation.from_euler("z", rng.uniform(0.0, 360.0), degrees=True).as_matrix()
     rotation = main.pose.rotation @ turn
@@ -225,16 +225,16 @@ def render(shot: Shot, seed: int, rng: np.random.Generator) -> GreyArray:
         _cover(irradiance, shot, obstacle, ground)
     irradiance *= shot.veil.share
     irradiance += shot.veil.light
-    grey = shot.look.sensor.expose(irradiance, shot.gain, rng)
-    if shot.look.jpeg_quality is None:
+    grey = shot.chain.sensor.expose(irradiance, shot.gain, rng)
+    if shot.chain.jpeg_quality is None:
         return grey
-    _, encoded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, shot.look.jpeg_quality])
+    _, encoded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, shot.chain.jpeg_quality])
     decoded: GreyArray = np.asarray(cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
     return decoded
 
 
 def _cover(irradiance: FloatArray, shot: Shot, obstacle: Obstacle, ground: Ground) -> None:
-    """Lay an obstacle over what is rendered so far, in place."""
+    """Draw an obstacle over the rendered irradiance, in place."""
     corner, size = outline_box(shot.camera, obstacle.pose, obstacle.shape)
     margin = shot.optics.reach_px
     column, row = np.floor(corner).astype(int) - margin

@@ -1,4 +1,4 @@
-"""Plates half in shade: how many are measured, and how well, by how much light the shade leaves.
+"""Plates half in shade: detection and errors, by the share of light left in the shade.
 
 Usage: python -m benchmarks.search.shaded_rings [--frames 40] [--seed 5]
 
@@ -20,11 +20,13 @@ _DISTANCE_M = (30.0, 140.0)
 
 
 @click.command()
-@click.option("--frames", type=click.IntRange(2), default=40, show_default=True, help="Per line.")
+@click.option(
+    "--frames", type=click.IntRange(2), default=40, show_default=True, help="Frames per line."
+)
 @click.option("--seed", type=click.IntRange(0), default=5, show_default=True)
 def main(frames: int, seed: int) -> None:
     """Print the table."""
-    print("camera    light left  measured  error, median and RMS [%]  z of distance, centre  > 3")
+    print("camera    light left  measured  error: median, RMS [%]   z: distance, centre   |z| > 3")
     for camera, light_left in _LINES:
         shadow = Shadow(light_left=light_left, edges=1, stripes=0)
         settings = settings_of(camera, "even", frames)

@@ -1,4 +1,4 @@
-"""Held against the truth of its frame: what was found, what was not, what is wrong."""
+"""Comparison of a frame's measurements with its truth: what was found, missed and wrong."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from kgcp.simulation.scene import PlatePose
 
 _Z95 = 1.959964
 _MAX_CENTRE_PX, _MAX_CENTRE_SIGMAS, _MAX_DISTANCE, _MAX_HEADING_DEG = 1.0, 6.0, 0.02, 10.0
-_NEAREST_PX = 3.0  # a measurement nearer than this to a plate, or than half its radius, is of it
+_NEAREST_PX = 3.0  # a measurement belongs to a plate within this distance, or half its radius
 
 
 @dataclass(frozen=True, slots=True)
 class FrameVerdict:
-    """What the search made of one frame.
+    """Result of the search in one frame.
 
     Attributes
     ----------
     wanted, found : int
-        Plates that should be found, and that were, well enough.
+        Number of plates that should be found, and that were measured well enough.
     decoys : int
-        Plates that should not be found.
+        Number of plates that should not be found.
     missed, off, wrong : tuple of (word, text)
-        A reason or a kind, and the numbers: plates not measured, measured badly, and
-        measurements of something else.
+        Plates not measured, plates measured badly, and measurements of something else, each with
+        its reason or kind and a description.
     """
 
     index: int
@@ -55,10 +55,11 @@ class _Notes:
 def judge_frame(index: int, shot: Shot, outcomes: Sequence[Outcome]) -> FrameVerdict:
     """Compare the outcomes of a frame with its plates.
 
-    Found is a plate that is measured under its name with its centre within one pixel or six
-    reported deviations, its distance within 2 % and its heading within ten degrees; `off`, one
-    measured less well; `wrong`, a measurement that is of no plate of that name: farther from
-    all of them than three pixels and half their radius, or a second one of the same plate.
+    A plate is found if it is measured under its name with the centre within one pixel or six
+    reported standard deviations, the distance within 2 % and the heading within ten degrees. It is
+    `off` if it is measured less accurately. A measurement is `wrong` if it belongs to no plate of
+    its name, because it is farther from all of them than three pixels and half their radius, or if
+    it is the second one of a plate.
     """
     left = [outcome for outcome in outcomes if isinstance(outcome, Measurement)]
     notes = _Notes()
@@ -87,11 +88,11 @@ def judge_frame(index: int, shot: Shot, outcomes: Sequence[Outcome]) -> FrameVer
 
 
 def describe(shot: Shot, seen: PlatePose) -> str:
-    """Return where a plate is and how it is seen."""
+    """Return the position, size, tilt and light of a plate in the image, in words."""
     x, y = shot.camera.project(seen.pose.translation_m)
     return (
         f"{seen.plate.target.name} at ({x:.0f}, {y:.0f}) R {radius_px(shot.camera, seen):.1f} px"
-        f" tilt {tilt_deg(seen.pose):.0f}° {shot.look.name} gain {shot.gain:.2f}"
+        f" tilt {tilt_deg(seen.pose):.0f}° {shot.chain.name} gain {shot.gain:.2f}"
         f" blur {shot.optics.psf_px:.2f} px"
     )
 
@@ -177,25 +178,25 @@ def table_line(frame_set: FrameSet, verdicts: Sequence[FrameVerdict]) -> str:
     )
     goal = f"{100.0 * frame_set.goal:.0f}" if frame_set.goal is not None else "–"
     reasons = Counter(word for v in verdicts for word, _ in v.missed)
-    told = [f"{word} {n} ({n / wanted:.1%})" for word, n in reasons.most_common()]
+    counts = [f"{word} {n} ({n / wanted:.1%})" for word, n in reasons.most_common()]
     taken = Counter(kind for v in verdicts for kind, _ in v.wrong)
-    told += [f"wrong at {kind} {n}" for kind, n in taken.most_common()]
+    counts += [f"wrong at {kind} {n}" for kind, n in taken.most_common()]
     return (
         f"{frame_set.name:14s}  {len(verdicts):6d}  {found:6d}/{wanted:<6d} {shares}  {goal:>5s}"
-        f"  {off:3d}  {wrong:5d}  {sum(v.decoys for v in verdicts):6d}  {', '.join(told)}"
+        f"  {off:3d}  {wrong:5d}  {sum(v.decoys for v in verdicts):6d}  {', '.join(counts)}"
     ).rstrip()
 
 
 def failure_lines(
     frame_set: FrameSet, verdicts: Sequence[FrameVerdict], most: int
 ) -> Iterator[str]:
-    """Yield all that is wrong or off, and the first plates of every reason that were missed."""
-    told: Counter[str] = Counter()
+    """Yield all wrong and off measurements, and the first missed plates of every reason."""
+    counts: Counter[str] = Counter()
     for verdict in verdicts:
         where = f"  {frame_set.name} {verdict.index}"
         yield from (f"{where}  WRONG {kind}: {text}" for kind, text in verdict.wrong)
         yield from (f"{where}  off by ring {ring}: {text}" for ring, text in verdict.off)
         for reason, text in verdict.missed:
-            told[reason] += 1
-            if told[reason] <= most:
+            counts[reason] += 1
+            if counts[reason] <= most:
                 yield f"{where}  {reason}: {text}"

@@ -182,9 +182,9 @@ def test_photographs_without_targets_raise_no_alarm(tmp_path: Path) -> None:
     runner = CliRunner()
     arguments = [str(tmp_path), "--variants", "3", "--jobs", "1"]
     told = runner.invoke(false_alarms.main, arguments, catch_exceptions=False).stdout
-    assert "3 pictures of 1 photographs, 5 layouts: 0 with something accepted" in told
+    assert "3 pictures of 1 photographs, 5 layouts: 0 with a false alarm" in told
     absent = runner.invoke(false_alarms.main, [str(tmp_path / "none")], catch_exceptions=False)
-    assert "nothing was looked at" in absent.stdout
+    assert "nothing was searched" in absent.stdout
 
 
 def test_variants_are_the_same_each_time(tmp_path: Path) -> None:
