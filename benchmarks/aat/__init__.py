@@ -1,1 +1,1 @@
-"""What KGCPs are worth in aerial triangulation."""
+"""The benefit of KGCPs in aerial triangulation."""

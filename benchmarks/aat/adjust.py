@@ -1,4 +1,4 @@
-"""The bundle adjustment of a corridor block, by GTSAM, with the calibration as an unknown."""
+"""Bundle adjustment of a corridor block by GTSAM, with the calibration as an unknown."""
 
 from __future__ import annotations
 
@@ -11,34 +11,41 @@ from gtsam.symbol_shorthand import C, K, L, S, X
 
 from benchmarks.aat.block import Block, calibrated
 from benchmarks.aat.gcps import KgcpSet
-from benchmarks.aat.settings import FREE_PARAMETERS, Way
+from benchmarks.aat.settings import FREE_PARAMETERS, Control
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 
-# Of gtsam.Cal3DS2: fx, fy, skew, u0, v0, k1, k2, p1, p2
+# Columns of gtsam.Cal3DS2 (fx, fy, skew, u0, v0, k1, k2, p1, p2) for each free parameter.
 _FREE_COLUMNS = ((0, 1), (3,), (4,), (5,), (6,))  # in the order of FREE_PARAMETERS
-# Deviations of what is known to be zero: fx − fy and skew; p1 and p2. Negligible in the image, but
-# not as small as to hide from GTSAM that the others are determined.
+# Standard deviations of values that are known to be zero: fx − fy and skew; p1 and p2. Their effect
+# in the image is negligible. With smaller ones, GTSAM takes the other parameters for undetermined.
 _FIXED_PX, _FIXED = 0.03, 1e-6
-_LOOSE = (3e3, 3e3, 3e3, 10.0, 10.0)  # of what is free: far above what any block leaves open
+_LOOSE = (
+    3e3,
+    3e3,
+    3e3,
+    10.0,
+    10.0,
+)  # prior standard deviations of free parameters, far above those of any block
 
-# Beside thousandths of a pixel GTSAM takes metres along the ray for undetermined. No real camera
-# is that true to its model either; 0.02 px are a third of a millimetre on the ground.
+# Added to the marks' standard deviations: with thousandths of a pixel, GTSAM takes metres along the
+# ray for undetermined. No real camera follows its model so closely either; 0.02 px are a third of a
+# millimetre on the ground.
 _MARK_FLOOR_PX = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """What an adjustment says about the check points and the camera.
+    """Check points and camera by an adjustment.
 
     Attributes
     ----------
     checks_enu_m : (c, 3) array
-        Places of the check points [m].
+        Positions of the check points [m].
     cov_m2 : (3 c, 3 c) array
-        Their covariance.
+        Joint covariance of these positions.
     calibration, sd_calibration : (5,) array
-        `FREE_PARAMETERS` and their deviations.
+        `FREE_PARAMETERS` and their standard deviations.
     """
 
     checks_enu_m: FloatArray
@@ -47,28 +54,30 @@ class Estimate:
     sd_calibration: FloatArray
 
 
-def adjust(block: Block, kgcps: KgcpSet, way: Way, sd_calibration: FloatArray | None) -> Estimate:
-    """Adjust a block in one of the ways.
+def adjust(
+    block: Block, kgcps: KgcpSet, control: Control, sd_calibration: FloatArray | None
+) -> Estimate:
+    """Adjust a block with one kind of control.
 
     Parameters
     ----------
     kgcps : KgcpSet
-        Used where the way says so.
+        Used if the control includes KGCPs.
     sd_calibration : (5,) array or None
-        Deviations of `FREE_PARAMETERS` in a calibration that is an observation besides, with its
-        errors drawn anew; None: nothing is known.
+        Standard deviations of `FREE_PARAMETERS` in a calibration that is an additional observation,
+        with newly drawn errors; None: there is no such calibration.
     """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     add_block(graph, values, block)
     add_calibration(graph, block, sd_calibration)
-    if way is Way.GCPS:
+    if control is Control.GCPS:
         add_gcps(graph, block)
-    if way in {Way.KGCPS, Way.DISTANCES}:
+    if control in {Control.KGCPS, Control.DISTANCES}:
         add_kgcps(graph, values, kgcps)
-    if way is Way.DISTANCES:
+    if control is Control.DISTANCES:
         add_distances(graph, values, kgcps, free_parameters(block.believed))
     found = _solve(graph, values)
-    return _estimate(graph, found, block.sights.checks)
+    return _estimate(graph, found, block.image_points.checks)
 
 
 def free_parameters(camera: Camera) -> FloatArray:
@@ -77,21 +86,23 @@ def free_parameters(camera: Camera) -> FloatArray:
 
 
 def calibration_of(camera: Camera) -> gtsam.Cal3DS2:
-    """Return a camera as GTSAM has it."""
+    """Return the calibration of a camera for GTSAM."""
     return gtsam.Cal3DS2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy, camera.k1, camera.k2)
 
 
 def add_block(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, block: Block) -> None:
-    """Add all image points and camera positions; start near the truth, by the old calibration."""
-    sights, settings = block.sights, block.settings
+    """Add image points and camera positions, with initial values near the truth."""
+    image_points, settings = block.image_points, block.settings
     mark = gtsam.noiseModel.Isotropic.Sigma(2, settings.sd_mark_px)
     tie = gtsam.noiseModel.Isotropic.Sigma(2, settings.sd_tie_px)
-    for frame, point, pixel in zip(sights.frame, sights.point, sights.pixels, strict=True):
-        noise = mark if point < sights.checks + sights.gcps else tie
+    for frame, point, pixel in zip(
+        image_points.frame, image_points.point, image_points.pixels, strict=True
+    ):
+        noise = mark if point < image_points.checks + image_points.gcps else tie
         graph.add(gtsam.GeneralSFMFactor2Cal3DS2(pixel, noise, X(int(frame)), L(int(point)), C(0)))
     for index, (view, centre) in enumerate(zip(block.views, block.gnss_enu_m, strict=True)):
         values.insert(X(index), gtsam.Pose3(gtsam.Rot3(view.enu_from_camera), centre))
-    for index, place in enumerate(sights.points_enu_m):
+    for index, place in enumerate(image_points.points_enu_m):
         values.insert(L(index), place)
     values.insert(C(0), calibration_of(block.believed))
     keys = [X(index) for index in range(len(block.views))]
@@ -101,7 +112,7 @@ def add_block(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, block: Bl
 def add_calibration(
     graph: gtsam.NonlinearFactorGraph, block: Block, sd_calibration: FloatArray | None
 ) -> None:
-    """Add what is known of the calibration: its form, and perhaps an observation of its values."""
+    """Add the fixed terms of the calibration, and an observation of its values if there is one."""
     observed, sd = block.believed, np.array(_LOOSE)
     if sd_calibration is not None:
         observed, sd = calibrated(block.seed, "laboratory", sd_calibration), sd_calibration
@@ -112,15 +123,15 @@ def add_calibration(
 
 
 def add_gcps(graph: gtsam.NonlinearFactorGraph, block: Block) -> None:
-    """Add the surveyed places of the classic GCPs."""
+    """Add the surveyed positions of the classic GCPs."""
     horizontal, up = block.settings.sd_gcp_m
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([horizontal, horizontal, up]))
-    for index, place in enumerate(block.gcps_enu_m, start=block.sights.checks):
+    for index, place in enumerate(block.gcps_enu_m, start=block.image_points.checks):
         graph.add(gtsam.PriorFactorPoint3(L(index), place, noise))
 
 
 def add_kgcps(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, kgcps: KgcpSet) -> None:
-    """Add places and image points of the KGCPs."""
+    """Add positions and image points of the KGCPs."""
     keys = [K(index) for index in range(len(kgcps.frame))]
     graph.add(places(keys, kgcps.position_enu_m, kgcps.cov_m2))
     floor = _MARK_FLOOR_PX**2 * np.eye(2)
@@ -137,7 +148,7 @@ def add_kgcps(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, kgcps: Kg
 def add_distances(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, kgcps: KgcpSet, believed: FloatArray
 ) -> None:
-    """Add the distances of the KGCPs, and the print's size as one unknown of all."""
+    """Add the distances of the KGCPs, with the size of the print as a common unknown."""
     for index, frame in enumerate(kgcps.frame):
         keys = [X(int(frame)), K(index), C(0), S(0)]
         graph.add(
@@ -165,7 +176,7 @@ def camera_centres(
         poses = [values.atPose3(key) for key in keys]
         if jacobians is not None:
             for index, pose in enumerate(poses):
-                # the pose's six: turn, then shift along the camera's axes
+                # six columns of the pose: rotation, then shift along the camera's axes
                 block = np.hstack((np.zeros((3, 3)), pose.rotation().matrix()))
                 jacobians[index] = _rows(block, index, len(keys))
         return (np.array([pose.translation() for pose in poses]) - observed_m).ravel()
@@ -195,17 +206,18 @@ def distance(
     by_calibration: FloatArray,
     believed: FloatArray,
 ) -> gtsam.CustomFactor:
-    """Return the factor of a distance that follows calibration and print.
+    """Return the factor of a distance that depends on calibration and print.
 
-    measured · (1 + s) + g · (calibration − believed) − ‖X − centre‖, where s is the relative error
-    of the print's size: the image stays, the distance that it stands for does not.
+    Its error is measured · (1 + s) + g · (calibration − believed) − ‖X − centre‖, where s is the
+    relative error of the print's size: for the same image, the distance changes with calibration
+    and size.
 
     Parameters
     ----------
     keys : sequence of int
-        Pose, point, calibration, and the size's error.
+        Keys of pose, point, calibration, and relative error of the size.
     measured_m, sd_m : float
-        By the calibration `believed` [m].
+        Distance by the calibration `believed` [m].
     by_calibration, believed : (5,) array
         g, and the calibration that kgcp was given.
     """
@@ -236,7 +248,7 @@ def calibration_vector(calibration: gtsam.Cal3DS2) -> FloatArray:
 
 
 def _by_calibration(slopes: FloatArray) -> FloatArray:
-    """Spread derivatives (5,) by `FREE_PARAMETERS` over the nine of GTSAM (1, 9)."""
+    """Return derivatives (1, 9) by GTSAM's parameters from those (5,) by `FREE_PARAMETERS`."""
     row = np.zeros((1, 9))
     for columns, slope in zip(_FREE_COLUMNS, slopes, strict=True):
         row[0, list(columns)] = slope / len(columns)
@@ -244,7 +256,7 @@ def _by_calibration(slopes: FloatArray) -> FloatArray:
 
 
 def _rows(block: FloatArray, index: int, count: int) -> FloatArray:
-    """Return zeros with a block (3, k) in the rows of one of `count` points, as GTSAM wants it."""
+    """Return a block (3, k) in the rows of one of `count` points, among zeros, for GTSAM."""
     rows = np.zeros((3 * count, block.shape[1]), order="F")
     rows[3 * index : 3 * index + 3] = block
     return rows
@@ -260,14 +272,16 @@ def _solve(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Val
 
 def _estimate(graph: gtsam.NonlinearFactorGraph, found: gtsam.Values, checks: int) -> Estimate:
     points = [L(index) for index in range(checks)]
-    # one elimination for all; point by point it takes longer than the adjustment
+    # one elimination for all points: one by one, it takes longer than the adjustment
     joint = gtsam.Marginals(graph, found).jointMarginalCovariance([C(0), *points])
     mean = np.zeros((len(_FREE_COLUMNS), 9))
     for row, columns in zip(mean, _FREE_COLUMNS, strict=True):
         row[list(columns)] = 1.0 / len(columns)
     return Estimate(
         np.array([found.atPoint3(point) for point in points]),
-        joint.fullMatrix()[9:, 9:],  # the calibration's nine come first, as c before l
+        joint.fullMatrix()[
+            9:, 9:
+        ],  # the nine of the calibration come first, since keys are sorted: c before l
         calibration_vector(found.atCal3DS2(C(0))),
         np.sqrt(np.diag(mean @ joint.at(C(0), C(0)) @ mean.T)),
     )

@@ -1,4 +1,4 @@
-"""A simulated corridor block: a UAV follows a vehicle with a target; truth and observations."""
+"""A simulated corridor block, with truth and observations: a UAV follows a vehicle."""
 
 from __future__ import annotations
 
@@ -34,26 +34,26 @@ _TRUE_CAMERA = Camera(
     k2=0.043,
     response=Response.LINEAR,
 )
-_STRIP_HALF_WIDTH_M = 36.0  # tie points: a little more than the frames see
+_STRIP_HALF_WIDTH_M = 36.0  # of tie points: a little wider than the frames see
 _BEYOND_ENDS_M = 28.0
 _CHECK_ACROSS_M = 16.0
 _GCP_ACROSS_M = 12.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sights:
+class ImagePoints:
     """Points of the ground and their images.
 
     Attributes
     ----------
     points_enu_m : (m, 3) array
-        True places: first the check points, then the classic GCPs, then tie points [m].
+        True positions: first the check points, then the classic GCPs, then tie points [m].
     checks, gcps : int
-        How many of each.
+        Number of check points and of GCPs.
     frame, point : (k,) arrays
-        Which frame sees which point.
+        Indices of frame and point of each image point.
     pixels : (k, 2) array
-        Where, with noise [px].
+        Image points, with noise [px].
     """
 
     points_enu_m: FloatArray
@@ -66,20 +66,20 @@ class Sights:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """A block: truth and everything observed but the target.
+    """A block: the truth, and all observations except those of the target.
 
     Attributes
     ----------
     camera, believed : Camera
-        True, and the calibration from before the flight, which the measurement of targets uses.
+        The true camera, and the calibration from before the flight, with which kgcp measures.
     views : tuple of CameraState
         True exterior orientations.
     gnss_enu_m : (n, 3) array
         Observed projection centres [m].
     gnss_cov_m2 : (3 n, 3 n) array
-        Their covariance.
+        Joint covariance of these positions.
     gcps_enu_m : (g, 3) array
-        Surveyed places of the classic GCPs [m].
+        Surveyed positions of the classic GCPs [m].
     """
 
     settings: BlockSettings
@@ -90,21 +90,21 @@ class Block:
     gnss_enu_m: FloatArray
     gnss_cov_m2: FloatArray
     gcps_enu_m: FloatArray
-    sights: Sights
+    image_points: ImagePoints
     ride: Ride
 
 
 def simulate_block(settings: BlockSettings, seed: int) -> Block:
-    """Fly a block; the same settings and seed give the same block."""
+    """Simulate a block; the same settings and seed give the same block."""
     times_s = settings.interval_s * np.arange(settings.frames, dtype=np.float64)
     ride = drive(settings, times_s, random_stream(seed, "ride"))
-    views = _fly(settings, times_s, random_stream(seed, "flight"))
-    sights = _look(settings, views, random_stream(seed, "sights"))
+    views = _camera_states(settings, times_s, random_stream(seed, "flight"))
+    image_points = _image_points_of(settings, views, random_stream(seed, "sights"))
     rng = random_stream(seed, "survey")
     centres = np.array([view.position_enu_m for view in views])
     cov = faded_covariance(times_s, settings.gnss_correlation_s, axes_of(settings.sd_gnss_drift_m))
     cov[np.diag_indices_from(cov)] += np.tile(np.square(axes_of(settings.sd_gnss_m)), len(views))
-    gcps = sights.points_enu_m[sights.checks : sights.checks + sights.gcps]
+    gcps = image_points.points_enu_m[image_points.checks : image_points.checks + image_points.gcps]
     return Block(
         settings,
         seed,
@@ -114,13 +114,13 @@ def simulate_block(settings: BlockSettings, seed: int) -> Block:
         centres + (np.linalg.cholesky(cov) @ rng.standard_normal(len(cov))).reshape(-1, 3),
         cov,
         gcps + axes_of(settings.sd_gcp_m) * rng.standard_normal(gcps.shape),
-        sights,
+        image_points,
         ride,
     )
 
 
 def calibrated(seed: int, purpose: str, sd: FloatArray) -> Camera:
-    """Return the true camera with errors of f, cx, cy, k1 and k2 of deviations (5,)."""
+    """Return the true camera with random errors of f, cx, cy, k1, k2; `sd` (5,) are theirs."""
     focal, *others = sd * random_stream(seed, purpose).standard_normal(5)
     focal_px = _TRUE_CAMERA.fx + float(focal)
     moved = {
@@ -130,10 +130,10 @@ def calibrated(seed: int, purpose: str, sd: FloatArray) -> Camera:
     return replace(_TRUE_CAMERA, fx=focal_px, fy=focal_px, **moved)
 
 
-def _fly(
+def _camera_states(
     settings: BlockSettings, times_s: FloatArray, rng: np.random.Generator
 ) -> tuple[CameraState, ...]:
-    """Return where the camera is: above the vehicle, but for some metres that come and go."""
+    """Return the states of the camera: above the vehicle, with offsets of some metres that vary."""
     n = len(times_s)
     phase = rng.uniform(0.0, 2.0 * np.pi, 2)
     far_m, aside_m = settings.wander_m
@@ -153,14 +153,14 @@ def _fly(
 
 
 def _facing_down(angle: float) -> FloatArray:
-    """Return ENU ← camera of a camera that looks down, the top of its image forward."""
+    """Return ENU ← camera of a camera that looks down with the top of its image forward."""
     cosine, sine = np.cos(angle), np.sin(angle)
     return np.array([[cosine, sine, 0.0], [sine, -cosine, 0.0], [0.0, 0.0, -1.0]])
 
 
-def _look(
+def _image_points_of(
     settings: BlockSettings, views: tuple[CameraState, ...], rng: np.random.Generator
-) -> Sights:
+) -> ImagePoints:
     points = _lay_points(settings, rng)
     seen, pixels = project_all(_TRUE_CAMERA, views, points)
     special = settings.checks + 2
@@ -173,7 +173,7 @@ def _look(
     frame, point = np.nonzero(seen[:, kept])
     sd_px = np.where(point < special, settings.sd_mark_px, settings.sd_tie_px)
     noise = sd_px[:, None] * rng.standard_normal((len(frame), 2))
-    return Sights(
+    return ImagePoints(
         points[kept], settings.checks, 2, frame, point, pixels[:, kept][frame, point] + noise
     )
 
@@ -203,7 +203,7 @@ def _lay_points(settings: BlockSettings, rng: np.random.Generator) -> FloatArray
 def project_all(
     camera: Camera, views: tuple[CameraState, ...], points_enu_m: FloatArray
 ) -> tuple[npt.NDArray[np.bool_], FloatArray]:
-    """Return which of n views see which of m points (n, m), and where (n, m, 2) [px]."""
+    """Return which of n views see which of m points (n, m), and their images (n, m, 2) [px]."""
     pixels = np.array(
         [
             camera.project((points_enu_m - view.position_enu_m) @ view.enu_from_camera)
@@ -215,4 +215,6 @@ def project_all(
     )
     limits = np.array([camera.width - 1.0, camera.height - 1.0])
     inside = np.all((pixels >= 0.0) & (pixels <= limits), axis=2)
-    return inside & (near < 60.0), pixels  # beyond, the distortion folds points back
+    return inside & (
+        near < 60.0
+    ), pixels  # farther out, the distortion would fold points back into the frame

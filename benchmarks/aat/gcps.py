@@ -1,4 +1,4 @@
-"""KGCPs of a simulated block: frames rendered, measured by kgcp and placed by kgcp."""
+"""KGCPs of a simulated block: kgcp measures rendered frames and computes the points."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.scene import PlatePose, SimulatedScene, render_irradiance
 from kgcp.targets.layout import Ring, Target
 
-_WINDOW_PX = np.array([480, 640])  # of the frame, about the target: all that is rendered
+_WINDOW_PX = np.array([480, 640])  # the rendered part of a frame, around the target
 _SENSOR = Sensor()
 _STREAK_PX = (0.0, 0.35)  # 7 m/s, 1/1200 s, 17 mm per pixel
 _DOWN = np.diag([1.0, -1.0, -1.0])  # axes of the ground's plane: x east, y south, z down
@@ -36,26 +36,26 @@ _DOWN = np.diag([1.0, -1.0, -1.0])  # axes of the ground's plane: x east, y sout
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KgcpSet:
-    """What an adjustment takes of n KGCPs.
+    """Observations of n KGCPs for an adjustment.
 
     Attributes
     ----------
     frame : (n,) array
         Index of the frame that sees the point.
     position_enu_m : (n, 3) array
-        Own coordinates, brought into the block's frame [m].
+        Coordinates of the points, in the frame of the block [m].
     cov_m2 : (3 n, 3 n) array
-        Their covariance with the correlations of docs/tables.md.
+        Joint covariance, with the correlations of docs/tables.md.
     pixels : (n, 2) array
         Image points [px].
     pixel_cov_px2 : (n, 2, 2) array
-        Their covariances.
+        Covariances of the image points.
     distance_m, sd_distance_m : (n,) arrays
-        Camera to target, by the calibration that kgcp was given [m].
+        Distances from camera to target, by the calibration that kgcp was given [m].
     by_calibration : (n, 5) array
         Derivatives of `distance_m` by f (= fx = fy), cx, cy, k1, k2 of that calibration.
     sd_common : float
-        Relative deviation that all distances share: the print's size.
+        Relative standard deviation of an error that all distances share: the size of the print.
     """
 
     frame: IndexArray
@@ -70,7 +70,7 @@ class KgcpSet:
 
 
 def kgcps_of(block: Block, keep: Path | None) -> KgcpSet:
-    """Return the block's KGCPs, rendered and measured unless they are in the folder `keep`."""
+    """Return the block's KGCPs; take them from the folder `keep` if it has them."""
     if keep is None:
         return measure_kgcps(block)
     key = hashlib.sha256(repr(block.settings).encode()).hexdigest()[:10]
@@ -87,7 +87,7 @@ def kgcps_of(block: Block, keep: Path | None) -> KgcpSet:
 
 
 def measure_kgcps(block: Block) -> KgcpSet:
-    """Render every frame's target, measure it, and let kgcp place it."""
+    """Render and measure the target of every frame, and compute the points by kgcp."""
     target = nominal_target(block.settings.sd_diameter_m)
     ground = Ground.grown(random_stream(block.seed, "ground"), block.settings.bend_radius_m)
     seen = [_measure(block, ground, target, index) for index in range(len(block.views))]
@@ -102,7 +102,7 @@ def measure_kgcps(block: Block) -> KgcpSet:
 
 
 def nominal_target(sd_diameter_m: float, scale: float = 1.0) -> Target:
-    """Return the target as it should be printed, or with all lengths times `scale`."""
+    """Return the target with its nominal size, or with all lengths times `scale`."""
     ring = _resized(TARGET_PLATE.target.ring, scale)
     replicas = tuple(_resized(replica, scale) for replica in TARGET_PLATE.target.replicas)
     return Target(replace(ring, sd_outer_diameter_m=sd_diameter_m), replicas)
@@ -119,20 +119,20 @@ def _resized(ring: Ring, scale: float) -> Ring:
 
 
 def window_of(camera: Camera, first_px: FloatArray) -> Camera:
-    """Return the camera of the window that begins at a whole pixel (2,) of the frame."""
+    """Return the camera of a window whose first pixel is the pixel (2,) of the frame."""
     width, height = map(int, _WINDOW_PX)
     x, y = map(float, first_px)
     return replace(camera, width=width, height=height, cx=camera.cx - x, cy=camera.cy - y)
 
 
 def render_window(block: Block, ground: Ground, index: int) -> tuple[GreyArray, FloatArray]:
-    """Render what one frame shows about the target.
+    """Render the window of one frame around the target.
 
     Returns
     -------
     grey : (height, width) array
     first_px : (2,) array
-        The window's first pixel in the frame.
+        First pixel of the window, in the frame.
     """
     ride, view = block.ride, block.views[index]
     rng = random_stream(block.seed, "pixels", index)
@@ -140,7 +140,7 @@ def render_window(block: Block, ground: Ground, index: int) -> tuple[GreyArray, 
     centre_px = block.camera.project(pose.translation_m[None])[0]
     first_px = np.rint(centre_px - 0.5 * _WINDOW_PX + rng.uniform(-40.0, 40.0, 2))
     principal_px = np.array([block.camera.cx, block.camera.cy])
-    # a camera's principal point is at most half a frame outside; 20 px for the believed one
+    # a principal point may be at most half a frame outside; 20 px of margin for the believed one
     first_px = np.clip(
         first_px,
         np.ceil(principal_px - 1.5 * _WINDOW_PX) + 20.0,
@@ -158,8 +158,8 @@ def render_window(block: Block, ground: Ground, index: int) -> tuple[GreyArray, 
 def distance_by_calibration(camera: Camera, pose: Pose) -> FloatArray:
     """Return the derivatives (5,) of a measured distance by `FREE_PARAMETERS` [m per unit].
 
-    A distance is the size of the target's image times the focal length: who adjusts the focal
-    length must let the distances follow.
+    A distance is proportional to the focal length, for the same image of the target. An adjustment
+    that changes the focal length must change the distances as well.
     """
     radius_m = 0.5 * TARGET_PLATE.target.ring.outer_diameter_m
     slopes = pose.translation_m / pose.distance_m @ pose_by_calibration(camera, radius_m, pose)[:3]
@@ -169,7 +169,7 @@ def distance_by_calibration(camera: Camera, pose: Pose) -> FloatArray:
 
 
 def _measure(block: Block, ground: Ground, target: Target, index: int) -> Measurement | None:
-    """Return the target as kgcp measures it, its image point in the whole frame."""
+    """Return kgcp's measurement of the target, with its image point in the whole frame."""
     grey, first_px = render_window(block, ground, index)
     believed = window_of(block.believed, first_px)
     outcome = measure_frame(grey, believed, (target,), DetectSettings())[0]
@@ -198,7 +198,7 @@ def _sighting(block: Block, index: int, seen: Measurement) -> Sighting:
 
 
 def _assembled(points: Sequence[Gcp], slopes: FloatArray, correlation_s: float) -> KgcpSet:
-    """Bring the points from the map into the block's frame, with their correlations."""
+    """Transform the points from the map to the block's frame, with their correlations."""
     local_frame = map_frame()
     position = local_frame.enu_from_map(np.array([point.position_map for point in points]))
     axes = local_frame.grid_rotation(position)

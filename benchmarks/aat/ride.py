@@ -1,4 +1,4 @@
-"""The vehicle with the target: its way along the corridor, and what its instruments say."""
+"""The drive of the vehicle with the target along the corridor, and its recorded trajectory."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ _POINT_ABOVE_ROAD_M = 0.4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ride:
-    """The vehicle: truth, and what its instruments say.
+    """The drive of the vehicle: truth and observations.
 
     Attributes
     ----------
     target_enu_m : (n, 3) array
-        The target's centre in every frame, true [m].
+        True centre of the target in every frame [m].
     enu_from_plate : (n, 3, 3) array
-        The plate's axes, true, as columns.
+        True axes of the plate, as columns.
     road_m : (n,) array
-        Height of the road below it [m].
+        Height of the road below the vehicle [m].
     plate_scale : float
-        True over nominal size of the print.
+        True size of the print, divided by the nominal one.
     trajectory : Trajectory
-        With its errors.
+        Recorded trajectory, with errors.
     settings : VehicleSettings
-        As the surveyor knows them.
+        Settings of the vehicle as the surveyor knows them, for example the lever arm.
     frame_times_s : (n,) array
-        Of the frames, by the surveyor's clock [s].
+        Recorded times of the frames [s].
     """
 
     target_enu_m: FloatArray
@@ -53,7 +53,7 @@ class Ride:
 
 
 def drive(settings: BlockSettings, times_s: FloatArray, rng: np.random.Generator) -> Ride:
-    """Drive along the corridor; frames are taken at times (n,) since the start [s]."""
+    """Simulate a drive along the corridor, with frames at times (n,) since the start [s]."""
     local_frame = map_frame()
     nominal = VehicleSettings(
         lever_arm_m=(-0.8, 0.15, -1.95),
@@ -75,7 +75,7 @@ def drive(settings: BlockSettings, times_s: FloatArray, rng: np.random.Generator
 
 
 def _states(settings: BlockSettings, elapsed_s: FloatArray) -> tuple[VehicleStates, FloatArray]:
-    """Return the true vehicle at times (n,), and the height of the road [m]."""
+    """Return the true states of the vehicle at times (n,), and the height of the road [m]."""
     along_m = settings.speed_m_s * elapsed_s + 2.0 * np.sin(0.11 * elapsed_s)
     road_m = ground_m(settings, along_m, np.zeros_like(along_m))
     states = VehicleStates(
@@ -94,7 +94,7 @@ def _record(
     duration_s: float,
     rng: np.random.Generator,
 ) -> Trajectory:
-    """Return the vehicle's trajectory with errors that fade over time."""
+    """Return the vehicle's trajectory with errors whose correlation decays over time."""
     elapsed_s = np.arange(-_LEAD_S, duration_s + _LEAD_S, _TRAJECTORY_INTERVAL_S)
     states, _ = _states(settings, elapsed_s)
     attitude_deg = np.column_stack((states.roll_deg, states.pitch_deg, states.heading_deg))

@@ -1,4 +1,4 @@
-"""What a simulated corridor block is like, and where its ground is.
+"""Settings of a simulated corridor block, and the shape of its ground.
 
 Everything is in one local Cartesian frame, east, north, up, about the centre of the bend.
 """
@@ -15,12 +15,12 @@ from kgcp.georef.local_frame import LocalFrame
 
 CRS = "EPSG:25832"
 ORIGIN_MAP: FloatArray = np.array([689_412.0, 5_336_208.0, 545.0])
-FROM_END_M = 10.0  # first and last check point and GCP, from the first and last frame
+FROM_END_M = 10.0  # distance of the outermost check points and GCPs from the outermost frames
 FREE_PARAMETERS = ("f", "cx", "cy", "k1", "k2")  # of the calibration; f = fx = fy
 
 
-class Way(StrEnum):
-    """What controls the block besides the positions of its cameras."""
+class Control(StrEnum):
+    """Control of the block in addition to the positions of its cameras."""
 
     GNSS = "GNSS only"
     GCPS = "+ 2 classic GCPs"
@@ -30,44 +30,46 @@ class Way(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class BlockSettings:
-    """What the block is like. Deviations are of one standard deviation.
+    """Settings of a block. Names with sd_ are standard deviations.
 
     Attributes
     ----------
     interval_s, speed_m_s : float
-        Of the frames [s]; of the vehicle and the UAV [m/s].
+        Interval between frames [s]; speed of the vehicle and the UAV [m/s].
     bend_radius_m : float
-        Of the corridor [m].
+        Radius of the corridor's bend [m].
     height_m, sd_height_m : float
-        Of the camera above the road [m].
+        Height of the camera above the road, and its variation [m].
     wander_m : tuple of float
-        How far the UAV comes and goes from above the vehicle, along and across [m].
+        Amplitude of the UAV's offset from the vehicle, along and across [m].
     relief_m, undulation_m : float
-        Height of tie points above ground, uniform from 0; amplitude of the ground's long waves [m].
+        Largest height of tie points above ground, from a uniform distribution; amplitude of the
+        ground's long waves [m].
     sd_tilt_deg, sd_heading_deg : float
-        Of the camera, from frame to frame [deg].
+        Roll and pitch, and heading, of the camera: variation from frame to frame [deg].
     tie_points, checks : int
-        Points on the ground, before those in fewer than three frames are left out.
+        Number of points on the ground, including those that fewer than three frames see.
     seen_share : float
-        Of the frames that see a tie point, how many have it measured.
+        Share of the frames with a tie point in view in which it is measured.
     sd_tie_px, sd_mark_px : float
-        Of the image of a tie point, and of the signalised check points and GCPs [px].
+        Noise of the images of tie points, and of the signalised check points and GCPs [px].
     sd_gnss_m, sd_gnss_drift_m : tuple of float
-        Camera positions, horizontal and up: from frame to frame, and the error that they share [m].
+        Errors of camera positions, horizontal and up: independent and correlated ones [m].
     gnss_correlation_s : float
-        Over which the shared error falls to 1/e [s].
+        Time over which the correlation of the latter falls to 1/e [s].
     sd_gcp_m : tuple of float
-        Classic ground control, horizontal and up [m].
+        Errors of classic GCPs, horizontal and up [m].
     sd_vehicle_m : tuple of float
-        Vehicle's trajectory, horizontal and up, fading over `VehicleSettings.correlation_s` [m].
+        Errors of the vehicle's trajectory, horizontal and up, with a correlation that decays over
+        `VehicleSettings.correlation_s` [m].
     sd_attitude_deg : float
-        Its roll, pitch and heading [deg].
+        Errors of the vehicle's roll, pitch and heading [deg].
     sd_lever_arm_m, sd_time_s : float
         Errors of the lever arm, per axis [m], and of the synchronisation [s].
     sd_diameter_m : float
-        Of the print [m].
+        Error of the diameter of the print [m].
     sd_believed : tuple of float
-        Of `FREE_PARAMETERS` in the calibration from before the flight.
+        Errors of `FREE_PARAMETERS` in the calibration from before the flight.
     """
 
     frames: int = 80
@@ -99,12 +101,12 @@ class BlockSettings:
 
     @property
     def length_m(self) -> float:
-        """Way of the vehicle from the first frame to the last [m]."""
+        """Distance that the vehicle drives from the first frame to the last [m]."""
         return (self.frames - 1) * self.interval_s * self.speed_m_s
 
     @property
     def checks_along_m(self) -> FloatArray:
-        """Where the check points are along the corridor: at least four frames see each [m]."""
+        """Positions of the check points along the corridor; at least four frames see each [m]."""
         return np.linspace(FROM_END_M, self.length_m - FROM_END_M, self.checks)
 
 
@@ -115,24 +117,24 @@ def random_stream(seed: int, purpose: str, index: int = 0) -> np.random.Generato
 
 
 def map_frame() -> LocalFrame:
-    """Return the frame of all blocks."""
+    """Return the local frame of all blocks."""
     return LocalFrame.at(CRS, ORIGIN_MAP)
 
 
 def axes_of(horizontal_and_up: tuple[float, float]) -> FloatArray:
-    """Return values (3,) of east, north and up."""
+    """Return values (3,) for east, north and up."""
     horizontal, up = horizontal_and_up
     return np.array([horizontal, horizontal, up])
 
 
 def faded_covariance(times_s: FloatArray, correlation_s: float, sd: FloatArray) -> FloatArray:
-    """Return the covariance (k n, k n) of n values of k errors that fade over time."""
+    """Return the covariance (k n, k n) of k errors at n times; their correlation decays."""
     fading = np.exp(-np.abs(times_s[:, None] - times_s) / correlation_s)
     return np.kron(fading, np.diag(np.square(sd)))
 
 
 def ground_m(settings: BlockSettings, along_m: FloatArray, across_m: FloatArray) -> FloatArray:
-    """Return the height of the ground [m], outside the corridor's axis positive."""
+    """Return the height of the ground [m]; `across_m` is positive outside the bend."""
     waves = np.sin(2.0 * np.pi * along_m / 420.0)
     height: FloatArray = settings.undulation_m * waves + 0.4 * np.sin(
         2.0 * np.pi * along_m / 95.0 + across_m / 12.0
@@ -143,7 +145,7 @@ def ground_m(settings: BlockSettings, along_m: FloatArray, across_m: FloatArray)
 def on_corridor(
     settings: BlockSettings, along_m: FloatArray, across_m: FloatArray, up_m: FloatArray
 ) -> FloatArray:
-    """Return places (n, 3) by their way along the bend, anticlockwise, and outside it."""
+    """Return positions (n, 3) by distance along the bend, anticlockwise, and outwards of it."""
     angle = along_m / settings.bend_radius_m
     radius_m = settings.bend_radius_m + across_m
     return np.column_stack((radius_m * np.cos(angle), radius_m * np.sin(angle), up_m))

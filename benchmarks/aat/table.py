@@ -1,4 +1,4 @@
-"""What many adjusted blocks say together: scatter against prediction, and the benefit."""
+"""Summary of many adjusted blocks: errors, their ratio to the prediction, and the benefit."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.aat.settings import Way
+from benchmarks.aat.settings import Control
 from kgcp.geometry.arrays import FloatArray
 
 _UP = 2
@@ -26,14 +26,14 @@ _COLUMNS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trial:
-    """One block, adjusted in one way.
+    """Result of one block with one calibration and kind of control.
 
     Attributes
     ----------
     error_m : (c, 3) array
-        Of the check points, east, north, up [m].
+        Errors of the check points: east, north, up [m].
     cov_m2 : (3 c, 3 c) array
-        As the adjustment predicts it.
+        Their covariance by the adjustment.
     """
 
     error_m: FloatArray
@@ -43,7 +43,7 @@ class Trial:
 
     @property
     def height_rms_m(self) -> float:
-        """RMS of the check points' heights [m]."""
+        """RMS of the height errors of the check points [m]."""
         return float(np.sqrt(np.mean(self.error_m[:, _UP] ** 2)))
 
     @property
@@ -53,30 +53,32 @@ class Trial:
 
     @property
     def mahalanobis2(self) -> float:
-        """χ² of all errors by their joint covariance, over their number; ideally 1."""
+        """χ² of all errors by their joint covariance, divided by their number; ideally 1."""
         error_m = self.error_m.ravel()
         return float(error_m @ np.linalg.solve(self.cov_m2, error_m)) / len(error_m)
 
 
-Trials = Mapping[tuple[str, Way], Sequence[Trial]]  # by calibration and way; in the seeds' order
+Trials = Mapping[tuple[str, Control], Sequence[Trial]]
+"""Results by calibration and control, each in the order of the seeds."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Row:
-    """All blocks, adjusted in one way.
+    """Summary of all blocks with one calibration and kind of control.
 
     Attributes
     ----------
     rms_m, predicted_m : (3,) arrays
-        East, north, up, over all check points of all blocks [m].
+        RMS of errors and of predicted standard deviations over all check points of all blocks:
+        east, north, up [m].
     scatter : (3,) array
-        Root mean square of error over predicted deviation, ideally 1.
+        RMS of the errors divided by their predicted standard deviations, ideally 1.
     sd_scatter : (3,) array
-        Its standard deviation, as known from this number of blocks.
+        Standard deviation of `scatter` for this number of blocks.
     whole_scatter : float
-        The same of all errors of a block together, by their joint covariance.
+        The same for all errors of a block together, by their joint covariance.
     benefit : float
-        Median over the blocks of GNSS only's height RMS over this one's.
+        Height RMS with GNSS only divided by that of this row: median over the blocks.
     """
 
     rms_m: FloatArray
@@ -90,10 +92,12 @@ class Row:
 
 
 def summarise(trials: Sequence[Trial], by_gnss: Sequence[Trial]) -> Row:
-    """Summarise the blocks of one way; `by_gnss` are the same blocks without control."""
+    """Summarise blocks; `by_gnss` are the same blocks with GNSS only."""
     errors = np.array([trial.error_m for trial in trials])
     variances = np.array([trial.variance_m2 for trial in trials])
-    squares = np.mean(errors**2 / variances, axis=1)  # per block: its points' errors go together
+    squares = np.mean(
+        errors**2 / variances, axis=1
+    )  # per block, since the errors of its points are correlated
     scatter = np.sqrt(squares.mean(axis=0))
     ratios = [
         alone.height_rms_m / trial.height_rms_m
@@ -111,23 +115,23 @@ def summarise(trials: Sequence[Trial], by_gnss: Sequence[Trial]) -> Row:
     )
 
 
-def rows_of(trials: Trials) -> dict[tuple[str, Way], Row]:
-    """Summarise every calibration and way."""
+def rows_of(trials: Trials) -> dict[tuple[str, Control], Row]:
+    """Summarise every calibration and kind of control."""
     return {
-        (calibration, way): summarise(some, trials[calibration, Way.GNSS])
-        for (calibration, way), some in trials.items()
+        (calibration, control): summarise(some, trials[calibration, Control.GNSS])
+        for (calibration, control), some in trials.items()
     }
 
 
-def table_lines(rows: Mapping[tuple[str, Way], Row]) -> Iterator[str]:
+def table_lines(rows: Mapping[tuple[str, Control], Row]) -> Iterator[str]:
     """Yield the table, as Markdown."""
     yield _line(_COLUMNS)
     yield _line(["---"] * len(_COLUMNS))
-    for (calibration, way), row in rows.items():
+    for (calibration, control), row in rows.items():
         yield _line(
             (
                 calibration,
-                way.value,
+                control.value,
                 _three(100.0 * row.rms_m, 1),
                 _three(100.0 * row.predicted_m, 1),
                 f"{_three(row.scatter, 2)} (± {row.sd_scatter.max():.2f})",

@@ -1,1 +1,1 @@
-"""Benchmarks of discs and of the calibration from them."""
+"""Benchmarks of the measurement of discs, and of calibrations from them."""

@@ -1,9 +1,9 @@
-"""Cramér-Rao bound of the centroid of a disc or a ring, from the exact rendering.
+"""Cramér-Rao bound of the centroid of a disc or a ring, from exact renderings.
 
-Unknown besides the centroid: diameter and tilt, point spread, two levels, the light's gradient, and
-two bends of the tone curve where the camera's response is unknown. The texture of the ground is a
-random field of known deviation and correlation. Pixels farther from the edge
-than `AROUND_PX` are not used: on a board they belong to the neighbours.
+The unknowns besides the centroid are diameter and tilt, point spread, two levels, the gradient of
+the light, and two bends of the tone curve if the camera's response is unknown. The texture of the
+ground is a random field with known standard deviation and correlation. Pixels farther from the edge
+than `AROUND_PX` are not used, because on a board they belong to other discs.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ def centroid_bound(
     tone_is_unknown: bool,
     texture: GroundTexture | None = None,
 ) -> FloatArray:
-    """Return the least covariance (2, 2) of the centroid of a scene's only disc [px²].
+    """Return the smallest covariance (2, 2) of the centroid of a scene's only disc [px²].
 
-    The disc is in front of the camera at a distance of 1, small enough for its image to be affine.
+    The disc is at a distance of 1 in front of the camera, and so small that its image is affine.
     """
     (disc,) = scene.discs
     pose = Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
@@ -55,7 +55,7 @@ def centroid_bound(
 
     step_m = _STEP_PX / camera.fx
     x, y, z = disc.position_m
-    hole = disc.inner_diameter_m / disc.diameter_m  # which grows with it
+    hole = disc.inner_diameter_m / disc.diameter_m  # ratio that stays the same if the disc grows
     columns = [
         slope(of_disc(position_m=(x + step_m, y, z)), of_disc(position_m=(x - step_m, y, z))),
         slope(of_disc(position_m=(x, y + step_m, z)), of_disc(position_m=(x, y - step_m, z))),
@@ -66,7 +66,7 @@ def centroid_bound(
             )
         ),
     ]
-    if disc.normal[2] < 0.999:  # else its tilt changes nothing to first order
+    if disc.normal[2] < 0.999:  # otherwise a tilt has no first-order effect
         turn = _STEP_PX / (camera.fx * disc.diameter_m)
         for axis in np.eye(3)[:2]:
             plus, minus = (

@@ -1,8 +1,10 @@
-"""Bursts whose camera moves a little: python -m benchmarks.calibrate.bursts.
+"""Bursts of photographs between which the camera moves a little.
 
-Discs are simulated without images. A smooth displacement over the frame is what the model of the
-lens lacks. How alike it acts on the camera in two photographs of a burst tells from where on they
-are of two places.
+    python -m benchmarks.calibrate.bursts
+
+Discs are simulated without images. A smooth displacement over the frame stands for the errors of
+the lens model. It acts on the estimated camera in every photograph. The correlation of its effects
+in two photographs of a burst shows from which movement on they count as two places.
 """
 
 from __future__ import annotations
@@ -19,10 +21,10 @@ from kgcp.network.records import CalibrationPrior, Estimate, Network, Observatio
 _CAMERA = Camera(1600, 1200, 1510.0, 1510.0, 811.0, 583.0, -0.11, 0.06)
 _PITCH_M, _DISTANCE_M, _TILT = 0.03, 0.33, 0.55
 _PLACES = 8
-_WAVES = 12  # of which a displacement consists
-_SPREAD = (0.7, 1.3)  # of their wavelengths
+_WAVES = 12  # number of waves in a displacement
+_SPREAD = (0.7, 1.3)  # range of their wavelengths, relative to the nominal one
 _LENSES = 40
-_APART = (0.0, 0.005, 0.015, 0.03, 0.04, 0.08)  # of the distance, or rad
+_APART = (0.0, 0.005, 0.015, 0.03, 0.04, 0.08)  # movements: relative to the distance, or [rad]
 _WAVELENGTHS_PX = (800, 400, 200)
 _KINDS = ("turn", "shift", "orbit")
 
@@ -37,17 +39,17 @@ def main() -> None:
 
 
 def correlation(wavelength_px: float, kind: str, apart: float) -> float:
-    """Return the correlation of what displacements do to the camera in two near photographs.
+    """Return the correlation between the effects of displacements in two similar photographs.
 
     Parameters
     ----------
     wavelength_px : float
-        Of the displacements.
+        Wavelength of the displacements.
     kind : str
         How the camera moves: `turn` about its projection centre, `shift`, or `orbit` about the
         middle of the field.
     apart : float
-        By how much: of the distance, or rad.
+        Amount of the movement: relative to the distance, or [rad].
     """
     both, first, second = 0.0, 0.0, 0.0
     for seed in range(_LENSES):
@@ -64,7 +66,7 @@ def correlation(wavelength_px: float, kind: str, apart: float) -> float:
 def _two_sessions(
     kind: str, apart: float, rng: np.random.Generator
 ) -> tuple[tuple[Network, Estimate], tuple[Network, Estimate]]:
-    """Return photographs from all sides, and those of the camera moved a little."""
+    """Return photographs from all sides, and the same with the camera moved a little."""
     columns, rows = np.meshgrid(np.arange(7.0), np.arange(5.0))
     points = _PITCH_M * np.stack((columns.ravel(), rows.ravel(), np.zeros(35)), axis=1)
     points -= points.mean(axis=0)
@@ -89,7 +91,7 @@ def _two_sessions(
 def _session(
     points: FloatArray, poses: list[tuple[FloatArray, FloatArray]]
 ) -> tuple[Network, Estimate]:
-    """Return exact photographs; translations are those of the field's middle, its origin."""
+    """Return photographs without errors; translations refer to the middle of the field."""
     model = FrameCameraModel(_CAMERA, ("k1", "k2"))
     values = model.values_of(_CAMERA)[None]
     view, point = np.divmod(np.arange(len(points) * len(poses)), len(points))
@@ -113,7 +115,7 @@ def _waves(wavelength_px: float, rng: np.random.Generator) -> tuple[FloatArray, 
 
 
 def _scores(network: Network, estimate: Estimate, waves: tuple[FloatArray, ...]) -> FloatArray:
-    """Return by how much displacements pull the camera's parameters (v, p), poses eliminated."""
+    """Return the gradients (v, p) of the camera's parameters by displacements, poses eliminated."""
     vectors, phases, amplitudes = waves
     places = computed(network, estimate)
     displaced = np.cos(places @ vectors.T + phases) @ amplitudes

@@ -1,10 +1,11 @@
-"""Calibrations of simulated fields: errors of the camera over their stated deviations.
+"""Calibrations of simulated fields: errors of the camera over their standard deviations.
 
     python -m benchmarks.calibrate.fields [--only NAME] [--seeds 2] [--jobs 2]
 
-Twelve sessions differ in camera, lens, board, light, blur and what the camera does to grey values.
-Each is rendered into a temporary folder and calibrated as by `kgcp calibrate`. One line per session
-and seed with z, error over deviation, of every parameter of the camera; then the RMS of all.
+Twelve sessions differ in camera, lens, board, light, blur and processing of grey values. Each is
+rendered into a temporary folder and calibrated as by `kgcp calibrate`. There is one line per
+session and seed, with z, the error over its stated standard deviation, of every parameter of the
+camera; the last line has the RMS of all z.
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ _FLAT_M = (0.00002, 0.00002, 0.0001)
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A session, and what kgcp is told of it."""
+    """A session, and what kgcp knows about it."""
 
     session: FieldSession
     response: Response = Response.UNKNOWN
-    quality: int = 0  # of JPEG; 0: PNG
+    quality: int = 0  # JPEG quality; 0: photographs are PNG
 
 
 def _board(
@@ -54,7 +55,7 @@ def _board(
     inner_mm: float = 0.0,
     is_bright: bool = False,
 ) -> Field:
-    """Return a field with a mark that gives it one way up."""
+    """Return a field with a mark that shows which way up it is."""
     mark = Mark(columns // 4, rows // 3, 1e-3 * diameter_mm, 1e-3 * 0.45 * diameter_mm)
     return Field(
         "board",
@@ -195,7 +196,7 @@ def write_photographs(case: Case, folder: Path, seed: int) -> None:
 
 
 def run(name: str, seed: int, jobs: int) -> tuple[np.ndarray, str]:
-    """Return z of the parameters that were estimated, and a line."""
+    """Return z of the estimated parameters, and a line of the table."""
     case = CASES[name]
     with tempfile.TemporaryDirectory() as folder:
         write_photographs(case, Path(folder), seed)

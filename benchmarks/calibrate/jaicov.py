@@ -1,7 +1,7 @@
-"""A published bundle adjustment, repeated: python -m benchmarks.calibrate.jaicov FOLDER.
+"""Comparison with a published bundle adjustment: python -m benchmarks.calibrate.jaicov FOLDER.
 
-The folder is JAICOV/example of applied-geodesy/bundle-adjustment: image coordinates in millimetres,
-exterior orientations, points and the protocol of their adjustment by AICON's JAICOV.
+FOLDER is JAICOV/example of applied-geodesy/bundle-adjustment: image coordinates in millimetres,
+exterior orientations, points, and the report of their adjustment by AICON's JAICOV.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from kgcp.network.records import (
     Solution,
 )
 
-_SD_MM = 0.0005  # of image coordinates; the protocol states another for the outliers it found
+_SD_MM = 0.0005  # of image coordinates; the report states another value for outliers
 _NUMBER = r"[-+]?\d[\d.]*(?:e[-+]\d+)?"
 _OBSERVATION = re.compile(r"^ +(\d+) +(\d+)(?: +[-\d.]+){4} +([\d.]+) +[\d.]+", re.MULTILINE)
 
@@ -86,7 +86,7 @@ class MetricCamera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Published:
-    """What the protocol of the adjustment states."""
+    """Results of the published adjustment, from its report."""
 
     values: FloatArray  # (7,)
     sd: FloatArray  # (7,)
@@ -98,7 +98,7 @@ class Published:
 
 
 def read_network(folder: Path) -> tuple[Network, Estimate, Published]:
-    """Return the network, the published solution as a start, and what was published of it."""
+    """Return the network, the published solution as initial values, and the published results."""
     interior = (folder / "example.ior").read_text(encoding="latin-1").split()
     ck, xh, yh, a1, a2, r0 = (float(word) for word in interior[2:8])
     b1, b2, c1, c2 = (float(word) for word in interior[9:13])
@@ -180,13 +180,13 @@ def _published(text: str, points: FloatArray, point_sd: FloatArray) -> Published
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """How far an adjustment is from the published one."""
+    """Differences between kgcp's adjustment and the published one."""
 
-    values_in_sd: FloatArray  # (7,): differences over published standard deviations
-    sd_ratio: FloatArray  # (7,): own over published
-    correlation_difference: float  # the largest
+    values_in_sd: FloatArray  # (7,): differences divided by the published standard deviations
+    sd_ratio: FloatArray  # (7,): kgcp's standard deviations divided by the published ones
+    correlation_difference: float  # largest difference of a correlation
     s0_mm: float
-    points_mm: float  # the largest difference of a coordinate
+    points_mm: float  # largest difference of a coordinate
     point_sd_ratio: FloatArray  # (m, 3)
 
 
@@ -219,13 +219,13 @@ def main() -> None:
     for name, difference, ratio in zip(
         network.model.names, result.values_in_sd, result.sd_ratio, strict=True
     ):
-        print(f"{name:3} differs by {difference:+.4f} sd, sd x {ratio:.4f}")
+        print(f"{name:3} differs by {difference:+.4f} sd, ratio of sd {ratio:.4f}")
     print(f"correlations differ by at most {result.correlation_difference:.4f}")
     low, high = np.quantile(result.point_sd_ratio, [0.01, 0.99])
-    print(f"points differ by at most {result.points_mm:.4f} mm, sd x {low:.3f}-{high:.3f}")
+    print(f"points differ by at most {result.points_mm:.4f} mm, ratio of sd {low:.3f}-{high:.3f}")
     robust = np.sqrt(known.camera_cov.diagonal())
     formal = np.sqrt(known.variance_factor * known.inverse.diagonal()[:7])
-    print("clustered over formal sd: " + " ".join(f"{r:.2f}" for r in robust / formal))
+    print("cluster-robust sd / formal sd: " + " ".join(f"{r:.2f}" for r in robust / formal))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
-"""Discs measured in rendered fields: error over the Cramér-Rao bound, bias, stated deviations.
+"""Discs measured in rendered fields: errors over bound and standard deviations, and bias.
 
-One line per case, polarity, radius and axis ratio; benchmarks/README.md explains the columns.
+There is one line per case, polarity, radius and axis ratio; benchmarks/README.md explains the
+columns.
 """
 
 from __future__ import annotations
@@ -31,41 +32,42 @@ from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 from kgcp.simulation.point_spread import Aberration
 
 _FOCAL_PX = 200_000.0  # so long that images are affine
-_COLUMNS, _ROWS = 5, 4  # of a photograph
+_COLUMNS, _ROWS = 5, 4  # discs of a photograph
 _GAP_PX = 14.0
-_SHIFT_PX = 0.5  # of each disc from its place among the others, at most
-# In JPEGs: large enough that discs lie at all offsets within the blocks of 8 × 8 pixels. Discs of
-# R 5 px were three blocks apart; all were compressed alike, and the curve was learned wrongly.
+_SHIFT_PX = 0.5  # largest random shift of a disc from the regular grid
+# The same, and the gap, in JPEGs: with these, discs lie at all offsets within the blocks of 8 × 8
+# pixels. Otherwise discs of R 5 px are three blocks apart; all are then compressed in the same way,
+# and the tone curve is learned wrongly.
 _SHIFT_IN_BLOCKS_PX, _GAP_BETWEEN_BLOCKS_PX = 4.0, 21.0
 _BRIGHT, _DARK = 0.62, 0.10
-_GRADIENT = 0.05  # of the light over one radius, at most over …
-_LARGEST_FALL = 0.3  # … the photograph's half width
+_GRADIENT = 0.05  # relative change of the light over one radius
+_LARGEST_FALL = 0.3  # largest relative change over half the width of a photograph
 _PSF_PX = 0.6
-_BOUND_LIGHTS = 9  # in which the bound is computed, from the darkest to the brightest
-_LEARNED_FROM = 5  # photographs, the tone curve and the sharpening: as `kgcp calibrate`
-_LEAST_DRAWS = 4  # for standard errors by the scatter between draws
+_BOUND_LIGHTS = 9  # levels of light for which the bound is computed
+_LEARNED_FROM = 5  # photographs from which tone curve and sharpening are learned
+_LEAST_DRAWS = 4  # with fewer draws, standard errors follow from the scatter of discs
 _POSE = Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What the camera does, and the limit of RMS over bound."""
+    """Camera and processing of a case, and the limit of RMS over bound."""
 
     tone: ToneCurve
     response: Response
     limit: float
     gain: float = 1.0
     sharpening: float = 0.0
-    quality: int = 0  # of JPEG; 0: none
-    defocus_px: float = 0.0  # radius of the disc that a point becomes
+    quality: int = 0  # JPEG quality; 0: not compressed
+    defocus_px: float = 0.0  # radius of the disc into which defocus spreads a point
 
     @property
     def shift_px(self) -> float:
-        """By how much discs are shifted from a regular grid, at most."""
+        """Largest random shift of a disc from the regular grid [px]."""
         return _SHIFT_IN_BLOCKS_PX if self.quality else _SHIFT_PX
 
     def pitch_px(self, radius_px: float) -> float:
-        """Return how far discs of a radius are from each other."""
+        """Return the pitch of the grid for discs with this radius [px]."""
         return 2.0 * radius_px + (_GAP_BETWEEN_BLOCKS_PX if self.quality else _GAP_PX)
 
     @property
@@ -114,26 +116,26 @@ class Setup:
     ratio: float
     photographs: int
     operator: Operator
-    gradient: float  # over one radius
+    gradient: float  # relative change of the light over one radius
     seed: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """What became of the discs of one setup."""
+    """Measurements of the discs of one setup."""
 
     setup: Setup
     present: int
     errors: FloatArray  # (n, 5)
     covariances: FloatArray  # (n, 5, 5)
-    bound_px2: FloatArray  # (n,): least variance of x and y, their mean, in each disc's own light
+    bound_px2: FloatArray  # (n,): bound of the mean variance of x and y, for the light on each disc
     along_light_px: FloatArray  # (n,): errors of the centre along the light's gradient
     ms_per_disc: float
-    draw: IndexArray  # (n,): which discs share what was learned of the camera
+    draw: IndexArray  # (n,): number of the draw; its discs share the learned camera
 
     @property
     def over_bound(self) -> float:
-        """RMS of the centre's errors over their bounds."""
+        """RMS of the centre's errors divided by their bounds."""
         return float(np.sqrt(np.mean(self._squares_over_bound)))
 
     @property
@@ -161,7 +163,7 @@ class Outcome:
         return self._se_of_mean(self.along_light_px)
 
     def _se_of_mean(self, values: FloatArray) -> float:
-        """Return the standard error of a mean of discs (n,): by draws from four on, or by discs."""
+        """Return the standard error of a mean over discs (n,), from draws if there are enough."""
         draws = int(self.draw.max()) + 1
         groups = self.draw if draws >= _LEAST_DRAWS else np.arange(len(values))
         sums = np.bincount(groups, values - values.mean())
@@ -175,7 +177,7 @@ class Outcome:
 
     @property
     def z(self) -> float:
-        """RMS of the centre's errors over their stated deviations."""
+        """RMS of the centre's errors divided by their stated standard deviations."""
         variances = np.diagonal(self.covariances, axis1=1, axis2=2)[:, :2]
         return float(np.sqrt(np.mean(self.errors[:, :2] ** 2 / variances)))
 
@@ -194,7 +196,7 @@ class Outcome:
 
 
 def measure(setup: Setup) -> Outcome:
-    """Render photographs of discs with random tilts and places, and measure them."""
+    """Render photographs of discs with random tilts and positions, and measure them."""
     cv2.setNumThreads(1)
     case, radius = CASES[setup.case], setup.radius_px
     rng = np.random.default_rng([setup.seed, int(10 * radius), len(setup.case)])
@@ -294,7 +296,7 @@ def _compressed(photo: GreyArray, quality: int) -> GreyArray:
 
 
 def nearest_disc(discs: Sequence[object], expected: FloatArray, radius_px: float) -> Disc | None:
-    """Return the one measured disc within half a radius of where it must be."""
+    """Return the measured disc within half a radius of its true place; None: none, or several."""
     near = [
         disc
         for disc in discs
@@ -306,7 +308,8 @@ def nearest_disc(discs: Sequence[object], expected: FloatArray, radius_px: float
 def _bound_by_light(setup: Setup, sensor: Sensor, fall: float) -> Callable[[float], float]:
     """Return the bound as a function of the light on a disc, 1 in the middle of a photograph.
 
-    Of a disc with some place between pixels, tilted in some direction: mean variance of x and y.
+    It is the mean variance of x and y of a disc with a certain place between pixels, tilted in a
+    certain direction.
     """
     case, radius = CASES[setup.case], setup.radius_px
     side = 2 * math.ceil(radius + 12.0) + 1
@@ -341,7 +344,7 @@ def setups(arguments: argparse.Namespace) -> Iterator[Setup]:
         few = max(2, round(arguments.discs / (_COLUMNS * _ROWS)))
         ratios = (0.5, 0.8, 1.0) if arguments.ratio is None else (arguments.ratio,)
         for number, polarity in enumerate(Polarity):
-            # each polarity with one tilt of the three, another for the next radius
+            # one of the three tilts for each polarity, another one for the next radius
             ratio = ratios[(number + arguments.radii.index(radius)) % len(ratios)]
             for draw in range(arguments.draws):
                 yield Setup(
@@ -387,12 +390,16 @@ def main() -> None:
     parser.add_argument("--cases", nargs="+", choices=list(CASES), default=list(CASES))
     radii = [3.0, 5.0, 8.0, 15.0, 30.0, 60.0, 150.0]
     parser.add_argument("--radii", nargs="+", type=float, default=radii)
-    parser.add_argument("--ratio", type=float, help="axis ratio of all; default: 0.5, 0.8, 1")
-    parser.add_argument("--gradient", type=float, default=_GRADIENT, help="of light per radius")
-    parser.add_argument("--discs", type=int, default=120, help="per line; 40 of R >= 100 px")
+    parser.add_argument("--ratio", type=float, help="axis ratio of all discs; default: 0.5, 0.8, 1")
+    parser.add_argument(
+        "--gradient", type=float, default=_GRADIENT, help="relative change of the light per radius"
+    )
+    parser.add_argument("--discs", type=int, default=120, help="discs per line; 40 if R >= 100 px")
     parser.add_argument("--operator", choices=[each.value for each in Operator], default="model")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--draws", type=int, default=1, help="of --discs each, pooled in a line")
+    parser.add_argument(
+        "--draws", type=int, default=1, help="random draws of --discs discs, combined in each line"
+    )
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     arguments = parser.parse_args()
     print(HEAD, flush=True)

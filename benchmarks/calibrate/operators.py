@@ -1,9 +1,12 @@
-"""The operators of three programs on the same discs: python -m benchmarks.calibrate.operators.
+"""Measuring methods of three programs on the same discs.
 
-Grey-weighted centroid above a threshold (as of Australis), the target function of Otepka & Fraser
-(2004) and kgcp's image model, each on the same rendered photographs of dark discs and of bright
-ones. Printed as the table of docs/method.md: RMS error of the centre over the Cramér-Rao bound, and
-its mean along the light's gradient, of dark discs or of bright ones, whichever is larger [px].
+    python -m benchmarks.calibrate.operators
+
+The methods are the grey-weighted centroid above a threshold (as in Australis), the target function
+of Otepka & Fraser (2004), and kgcp's image model. Each measures the same rendered photographs of
+dark and of bright discs. The output is the table of docs/method.md: the RMS of the centre's errors
+divided by the Cramér-Rao bound, and the mean error along the light's gradient [px], of dark or of
+bright discs, whichever is larger.
 """
 
 from __future__ import annotations
@@ -18,8 +21,8 @@ from benchmarks.pool import ordered_map
 from kgcp.measurement.discs.records import Operator, Polarity
 from kgcp.pipeline.execution.threads import use_one_thread_each
 
-_RATIO = 0.8  # of the axes
-_GRADIENT = 0.05  # of the light over one radius
+_RATIO = 0.8  # of the axes of the discs' images
+_GRADIENT = 0.05  # relative change of the light over one radius
 ROWS = {
     "linear, even light": ("linear", 0.0),
     "linear": ("linear", _GRADIENT),
@@ -28,13 +31,13 @@ ROWS = {
     "film, curve unknown": ("unknown_film", _GRADIENT),
     "film, sharpened, JPEG": ("consumer", _GRADIENT),
 }
-"""Case and gradient, by what the table calls them."""
+"""Case and gradient by name of the row."""
 
 _OPERATORS = (Operator.CENTROID, Operator.GAUSSIAN, Operator.MODEL)
 
 
 def setups(radii: Sequence[float], photographs: int, seed: int) -> list[Setup]:
-    """Return all measurements: by row, radius and operator, of dark discs and of bright ones."""
+    """Return all setups: by row, radius and operator, for dark and for bright discs."""
     return [
         Setup(case, polarity, radius, _RATIO, photographs, operator, gradient, seed)
         for case, gradient in ROWS.values()
@@ -45,7 +48,7 @@ def setups(radii: Sequence[float], photographs: int, seed: int) -> list[Setup]:
 
 
 def cell(pair: Sequence[Outcome]) -> str:
-    """Return RMS over bound of all discs, the larger bias, and n/m if of m only n are found."""
+    """Return RMS over bound of all discs, the larger bias, and n/m if only n of m are found."""
     found, present = sum(len(one.errors) for one in pair), sum(one.present for one in pair)
     if not found:
         return f"0/{present}"
@@ -61,7 +64,9 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--radii", nargs="+", type=float, default=[5.0, 15.0])
-    parser.add_argument("--photographs", type=int, default=3, help="of 20 discs, per polarity")
+    parser.add_argument(
+        "--photographs", type=int, default=3, help="photographs of 20 discs, per polarity"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     arguments = parser.parse_args()

@@ -1,8 +1,8 @@
-"""Whether discs have the right names: by their places, sizes and holes, photograph by photograph.
+"""Check of the names of discs in each photograph, by their places, sizes and holes.
 
-Nobody says which disc is which in a photograph. But a field that is named wrongly is mirrored, lies
-beside itself, or has its marks where there are none. A field that looks the same when it is turned
-has no wrong turn.
+The true names are not known. But if the discs of a field have wrong names, the field is mirrored,
+shifted against itself, or has marks where the photograph shows none. If a field looks the same when
+turned, all of these turns count as right.
 """
 
 from __future__ import annotations
@@ -17,36 +17,37 @@ from kgcp.geometry.circle_image import Circles3D, circle_images, plane_axes
 from kgcp.network.calibration_records import CameraCalibration
 from kgcp.pipeline.calibration.run import PhotoCalibration
 
-_MOST_OFF = 0.25  # of the distance to the nearest disc: a wrong name is off by all of it
-_CLEAR_HOLE_PX = 2.0  # radius, from which on the middle of a hole shows the ground
+_MOST_OFF = 0.25  # largest error of a place, in distances to the nearest disc; 1 for a wrong name
+_CLEAR_HOLE_PX = 2.0  # least radius of a hole whose middle shows the ground
 
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """What was looked at, and the photographs whose discs have wrong names."""
+    """Counts of what was checked, and the photographs whose discs have wrong names."""
 
     photographs: int
     discs: int
     marks: int
-    farthest: float  # of a disc from where its name puts it, of the distance to the nearest disc
+    farthest: float  # largest error of a place, in distances to the nearest disc
     wrong: tuple[str, ...]
 
     @property
     def line(self) -> str:
-        """What was found."""
+        """The result in words."""
         return (
             f"order: {len(self.wrong)} of {self.photographs} photographs wrong; {self.discs} discs"
-            f" at most {self.farthest:.3f} of the way to their neighbour, {self.marks} marks"
+            f" off by at most {self.farthest:.3f} of the distance to their neighbour,"
+            f" {self.marks} marks"
         )
 
 
 def order_of(made: PhotoCalibration, greys: Mapping[str, GreyArray]) -> Order:
-    """Return whether the discs of a calibration have the right names.
+    """Check whether the discs of a calibration have the right names.
 
     Parameters
     ----------
     greys : mapping of array
-        The photographs by their names.
+        Grey values of the photographs by name.
     """
     calibration, wrong, marks, farthest = made.calibration, [], 0, 0.0
     field = calibration.field
@@ -82,7 +83,7 @@ def _expected(calibration: CameraCalibration, index: int) -> tuple[FloatArray, b
 
 
 def _off_by_names(images: FloatArray, point: IndexArray, vectors: FloatArray) -> FloatArray:
-    """Return how far discs (k,) are from where they must be, of the way to the nearest other."""
+    """Return errors (k,) of the discs' places, in distances to the nearest other disc."""
     off_px = np.linalg.norm(vectors[:, :2] - images[point, :2], axis=1)
     gaps_px = np.linalg.norm(images[point, None, :2] - images[:, :2], axis=2)
     gaps_px[np.arange(len(point)), point] = np.inf
@@ -97,9 +98,9 @@ def _radius_px(vectors: FloatArray) -> FloatArray:
 def _is_of_its_size(
     images: FloatArray, vectors: FloatArray, radii: FloatArray, point: IndexArray
 ) -> BoolArray:
-    """Return whether discs (k,) are nearer to the size of their name than to another of the field.
+    """Return whether the sizes of discs (k,) are nearest to those that their names have.
 
-    Marks of ros10 are larger than its description says by a quarter.
+    The marks of ros10 are a quarter larger than its description says.
     """
     grown = _radius_px(vectors) / _radius_px(images)
     seen = radii[point] * grown / np.median(grown)
@@ -109,8 +110,8 @@ def _is_of_its_size(
 
 
 def _is_hole_seen(grey: GreyArray, places_px: FloatArray, appearance: FloatArray) -> BoolArray:
-    """Return where the middle of a disc is more like the ground than like the disc."""
+    """Return whether the middle of each disc is more like the ground than like the disc."""
     columns, rows = np.rint(places_px).astype(int).T
     middle = grey[rows, columns] / np.iinfo(grey.dtype).max
-    inside, outside = np.clip(appearance[:, :2], 0.0, 1.0).T  # of burnt levels, what is seen
+    inside, outside = np.clip(appearance[:, :2], 0.0, 1.0).T  # burnt levels are seen as 1
     return np.asarray(np.abs(middle - outside) < np.abs(middle - inside))

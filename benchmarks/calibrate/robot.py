@@ -1,12 +1,13 @@
-"""Poses of a calibration against those of the robot that held the camera.
+"""Comparison of the poses of a calibration with those of the robot that held the camera.
 
     python -m benchmarks.calibrate.robot FOLDER [--jobs 2]
 
 FOLDER is ros10 of ros-industrial/industrial_calibration: photographs, cal_data.yaml, and the
-robot's pose at every photograph in poses/. The camera's place on the robot and the board's are
-adjusted to both. What is left is where the corners of the board are by the photographs, less where
-the robot puts them, in depth and across, RMS over corners and photographs. Each of the camera's
-axes counts by what it leaves; all alike, some 0.5 mm more are left in depth.
+robot's pose at every photograph in poses/. The pose of the camera on the robot and that of the
+board are adjusted to both. The residuals are the positions of the board's corners by the
+photographs minus those by the robot, in depth and across; the table has their RMS over corners and
+photographs. The axes of the camera are weighted by their residuals. With equal weights, the
+residuals in depth are some 0.5 mm larger.
 """
 
 from __future__ import annotations
@@ -38,18 +39,18 @@ from kgcp.pipeline.calibration.run import CalibrationOptions, calibrate_photos, 
 from kgcp.pipeline.detect import NoProgress
 
 _WEIGHTINGS = 4
-_LIMIT_MM = 1.35  # in depth, with the board free
+_LIMIT_MM = 1.35  # of the RMS in depth, with the shape of the board estimated
 
 
 def read_robot(folder: Path, names: list[str]) -> tuple[Rotation, FloatArray]:
-    """Return the turns and places [m] of the robot's wrist in its base, by photograph."""
+    """Return rotations and positions [m] of the robot's wrist in its base, by photograph."""
     poses = [yaml.safe_load((folder / "poses" / f"{Path(n).stem}.yaml").read_text()) for n in names]
     turns = Rotation.from_quat([[pose[key] for key in ("qx", "qy", "qz", "qw")] for pose in poses])
     return turns, np.array([[pose[key] for key in "xyz"] for pose in poses])
 
 
 def corner_errors_mm(calibration: CameraCalibration, folder: Path) -> FloatArray:
-    """Return, in the camera's frames, corners by the photographs less by the robot (n, 3) [mm]."""
+    """Return corners by the photographs minus by the robot (n, 3) [mm], in the camera's axes."""
     wrist, places = read_robot(folder, [view.photo for view in calibration.views])
     estimate = calibration.solution.estimate
     boards = Rotation.from_matrix(estimate.rotations)
@@ -58,7 +59,7 @@ def corner_errors_mm(calibration: CameraCalibration, folder: Path) -> FloatArray
     corners = estimate.points[[f(s) for s in extent for f in (np.argmin, np.argmax)]]
     seen = np.stack([board.apply(corners) for board in boards]) + estimate.translations[:, None]
 
-    # turns between photographs are about the same axes, seen from wrist and camera
+    # rotations between photographs have the same axes, expressed in wrist and camera
     pairs = list(itertools.combinations(range(len(places)), 2))
     of_wrist = [(wrist[i].inv() * wrist[j]).as_rotvec() for i, j in pairs]
     of_camera = [(boards[i] * boards[j].inv()).as_rotvec() for i, j in pairs]
@@ -80,7 +81,9 @@ def corner_errors_mm(calibration: CameraCalibration, folder: Path) -> FloatArray
     def weighted(unknowns: FloatArray, scales: FloatArray) -> FloatArray:
         return np.asarray((errors_m(unknowns) / scales).ravel())
 
-    scales = np.ones(3)  # the camera's axes err differently: each counts by what it leaves
+    scales = np.ones(
+        3
+    )  # the camera's axes have different errors: each is weighted by its residuals
     for _ in range(_WEIGHTINGS):
         start = optimize.least_squares(weighted, start, x_scale="jac", args=(scales,)).x
         scales = np.sqrt(np.mean(errors_m(start) ** 2, axis=0))
@@ -88,7 +91,7 @@ def corner_errors_mm(calibration: CameraCalibration, folder: Path) -> FloatArray
 
 
 def main() -> None:
-    """Print a line for the board as stated, and one for the board as it is."""
+    """Print a line for the board as stated, and one for the board with its estimated shape."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--jobs", type=int, default=2)

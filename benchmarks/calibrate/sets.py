@@ -1,6 +1,6 @@
-"""Calibrations from other people's photographs: python -m benchmarks.calibrate.sets --sets DIR.
+"""Calibrations from published photographs: python -m benchmarks.calibrate.sets --sets DIR.
 
-DIR holds one folder per set, as they are published:
+DIR has one folder per set, with the files as published:
 
 - boof_regular, boof_hexagonal: BoofCV-Data, example/calibration/mono
 - abhijit_symmetric, abhijit_asymmetric: Abhijit-2592/camera_calibration_API
@@ -52,21 +52,21 @@ _HALVES = 16
 
 @dataclass(frozen=True, slots=True)
 class Set:
-    """One set of photographs, and what must come out."""
+    """One set of photographs, and the criteria for its results."""
 
     name: str
     folder: str
-    pattern: str  # of the photographs
-    field: str  # a shorthand, or a file of the folder
+    pattern: str  # of the photographs' names
+    field: str  # a shorthand, or a file in the folder
     unit: str | None
     views: int
     least_discs: int
-    fixed_px: float  # largest RMS per point
+    fixed_px: float  # largest RMS per point with the field fixed; free_px: with it free
     free_px: float | None
     peer: str
     focal: tuple[float, float] | None = None  # truth and largest error [px]
     centre: tuple[float, float, float] | None = None  # truth and largest error [px]
-    is_centre_unknown: bool = False  # the principal point must not be claimed
+    is_centre_unknown: bool = False  # whether it must be reported as not determined
 
 
 SETS = (
@@ -91,7 +91,7 @@ SETS = (
         "dice_dark", "dice_sim", "dot_*.jpeg", "sim_dot_input.xml", None,
         21, 2600, 0.006, 0.0046, "OpenCV none", (6673.3159, 1.0), (872.1577, 579.955, 0.15),
     ),
-    # negatives of dice_dark's first eleven: light adds to these discs, and white is burnt
+    # negatives of the first eleven of dice_dark: light adds to these discs, and white is burnt
     Set(
         "dice_white", "dice_sim", "white_dot_*.jpeg", "sim_white_dot_input.xml", None,
         11, 1300, 0.006, 0.0046, "OpenCV none", (6671.8, 2.5),
@@ -100,7 +100,7 @@ SETS = (
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print a line per set, and what fails its acceptance."""
+    """Print a line per set, and the criteria that are not met."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sets", type=Path, required=True, metavar="DIR")
     parser.add_argument("--only", metavar="ID", choices=[each.name for each in SETS])
@@ -148,7 +148,7 @@ def _run(chosen: Set, sets: Path, jobs: int, halves: int, operator: Operator) ->
         f"  {seconds:5.1f}  {verdict}, {chosen.peer}",
         flush=True,
     )
-    print(f"    free, less what bends each photograph: {_unbent_px(free):.4f} px")
+    print(f"    free, without the bend of each photograph: {_unbent_px(free):.4f} px")
     if z:
         print("    halves z:", ", ".join(f"{name} {value:.2f}" for name, value in z.items()))
     paths = {photo.name: photo.path for photo in photos}
@@ -181,9 +181,10 @@ def _by_photograph(calibration: CameraCalibration) -> str:
 
 
 def _unbent_px(calibration: CameraCalibration) -> float:
-    """Return the RMS per point of residuals less a bend of each photograph: second order in x, y.
+    """Return the RMS per point of residuals minus a quadratic function of x, y per photograph.
 
-    The noise of single discs makes no such bend. The sheet does, or the light on it.
+    Such a function describes a bend of the sheet, or of the light on it; the noise of single discs
+    has hardly any part in it.
     """
     observed, solution = calibration.network.observations, calibration.solution
     x, y = calibration.field.points_m()[:, :2].T
@@ -204,7 +205,7 @@ def _rms(values: Iterable[float]) -> float:
 
 
 def _by_all_terms(made: PhotoCalibration, points: PointModel) -> CameraCalibration:
-    """Return what the peers estimate of the camera: all terms, whether they are worth it or not."""
+    """Return the calibration with all terms of the lens, as other programs estimate them."""
     peers = CalibrationSettings(points, LensModel.BROWN)
     return min(
         (_again(made, replace(peers, is_same_aspect=is_same)) for is_same in (True, False)),
@@ -225,7 +226,7 @@ def _failures(
     free: CameraCalibration,
     photos: Sequence[Photo],
 ) -> list[str]:
-    """Return what does not meet the acceptance."""
+    """Return the criteria that are not met, in words."""
     camera, measured = stiff.camera, len(stiff.network.observations.view)
     checks = [
         (len(stiff.views) == len(photos) == chosen.views, f"views: {len(stiff.views)}"),
@@ -242,12 +243,12 @@ def _failures(
         off = max(abs(camera.cx - x), abs(camera.cy - y))
         checks.append((off <= limit, f"principal point: {off:.2f} px"))
     if chosen.is_centre_unknown:
-        checks.append((bool({"cx", "cy"} & {*stiff.undetermined}), "claims a principal point"))
+        checks.append((bool({"cx", "cy"} & {*stiff.undetermined}), "reports a principal point"))
     return [text for is_met, text in checks if not is_met]
 
 
 def halves_z(whole: CameraCalibration, count: int) -> dict[str, float]:
-    """Return, by parameter, differences of random halves over their deviations, RMS.
+    """Return, by parameter, the RMS of differences of random halves over their standard deviations.
 
     The parameters are those of the whole set, so that both halves estimate the same ones.
     """

@@ -1,10 +1,10 @@
-"""Discs crossed by the edge of a shadow: errors of the centre over their stated deviations.
+"""Discs crossed by the edge of a shadow: errors of the centre over their standard deviations.
 
     python -m benchmarks.calibrate.shadow [--radii 8 14 30] [--depths 0.2 0.45] [--seed 0]
 
 Every disc of a rendered photograph is crossed by the edge of a shadow, at a random place within 0.8
-of its radius. The shadow takes a share (depth) of the light. Edges are logistic: their width is
-what nine tenths of the change take [px]. The camera is linear.
+of its radius. The shadow takes away a share (depth) of the light. Edges are logistic; their width
+is that of nine tenths of the change [px]. The camera is linear.
 """
 
 from __future__ import annotations
@@ -32,15 +32,16 @@ _FOCAL_PX = 200_000.0  # so long that images are affine
 _COLUMNS, _ROWS = 6, 4
 _POSE = Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
 _WIDTHS_PX = (60.0, 30.0, 12.0, 3.0)
-_NINE_TENTHS = 2.0 * math.log(19.0)  # of a logistic step, in units of its scale
-_LEAST_Z, _MOST_Z = 0.4, 2.3  # as measured: under soft edges, deviations may be stated too small
+_NINE_TENTHS = 2.0 * math.log(19.0)  # width of nine tenths of a logistic step, in its scale
+# measured range of z; under soft edges, the stated standard deviations may be too small
+_LEAST_Z, _MOST_Z = 0.4, 2.3
 
 
 @dataclass(frozen=True, slots=True)
 class ShadowedScene(FieldScene):
-    """A field under the shadows of bars that are upright in the frame."""
+    """A field under the shadows of bars that are vertical in the frame."""
 
-    edges_px: tuple[float, ...] = ()  # columns, of shadow and light in turns
+    edges_px: tuple[float, ...] = ()  # columns of the edges, between shadow and light in turns
     depth: float = 0.0
     scale_px: float = 1.0  # of the logistic step
 
@@ -55,7 +56,7 @@ class ShadowedScene(FieldScene):
 def errors(
     radius_px: float, depth: float, width_px: float, photographs: int, seed: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return errors (k, 2) and stated deviations (k, 2) of the centres that were measured [px]."""
+    """Return errors (k, 2) and stated standard deviations (k, 2) of the measured centres [px]."""
     rng = np.random.default_rng([seed, int(radius_px), int(100 * depth), int(width_px)])
     pitch = 2.0 * radius_px + 24.0
     width, height = int((_COLUMNS + 0.4) * pitch), int((_ROWS + 0.4) * pitch)
@@ -100,7 +101,9 @@ def main() -> None:
     parser.add_argument("--radii", nargs="+", type=float, default=[8.0, 14.0, 30.0])
     parser.add_argument("--depths", nargs="+", type=float, default=[0.2, 0.45])
     parser.add_argument("--widths", nargs="+", type=float, default=list(_WIDTHS_PX))
-    parser.add_argument("--photographs", type=int, default=3, help="of 24 discs, per line")
+    parser.add_argument(
+        "--photographs", type=int, default=3, help="photographs of 24 discs, per line"
+    )
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
     cv2.setNumThreads(1)

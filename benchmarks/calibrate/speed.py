@@ -1,9 +1,9 @@
-"""Time of `kgcp calibrate` on photographs of 12 Mpx with 200 discs.
+"""Wall and CPU time of `kgcp calibrate` on photographs of 12 Mpx with 200 discs.
 
     python -m benchmarks.calibrate.speed [--photographs 20] [--jobs 2] [--response unknown]
 
-The photographs are rendered into a temporary folder first, which is not timed. Wall time depends on
-what else the machine does; CPU time hardly does, but that of workers may be missing in it: take it
+The photographs are first rendered into a temporary folder, which is not timed. Wall time depends on
+other work of the machine; CPU time hardly does, but may not include that of workers: measure it
 with --jobs 0.
 """
 
@@ -25,7 +25,7 @@ from kgcp.io.flight.field_file import read_field
 from kgcp.simulation.field_session import FieldSession, field_photograph, printed_points
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 
-_FIELD = "asymmetric:8x25:20mm:14mm"  # 200 discs that show which way is up
+_FIELD = "asymmetric:8x25:20mm:14mm"  # 200 discs whose arrangement shows which way is up
 _CAMERA = Camera(4000, 3000, 4100.0, 4100.0, 2012.0, 1489.0, -0.08, 0.05)
 _LIMIT_S = 60.0  # on two cores
 
@@ -48,7 +48,9 @@ def main() -> None:
     parser.add_argument("--photographs", type=int, default=20)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--response", choices=("linear", "srgb", "unknown"), default="unknown")
-    parser.add_argument("--folder", type=Path, help="photographs of an earlier run, to be kept")
+    parser.add_argument(
+        "--folder", type=Path, help="folder that keeps the photographs, to reuse them the next time"
+    )
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = arguments.folder or Path(temporary) / "photographs"

@@ -1,1 +1,1 @@
-"""First flights: bare folders as they come from card and rover, and the way from them to points."""
+"""First flights: folders with the files of card and rover, and the commands that make points."""

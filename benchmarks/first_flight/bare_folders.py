@@ -37,14 +37,14 @@ from kgcp.simulation.presets import preset
 from kgcp.simulation.scene import PlatePose, SimulatedScene, render_irradiance
 
 LEVER_ARM = LEVER_ARM_M
-"""What the surveyor measures on the vehicle [m]."""
+"""Lever arm that the surveyor measures on the vehicle [m]."""
 STATIC_MAP: FloatArray = ORIGIN_MAP + np.array([20.0, -35.0, 0.6])
-"""Where the static target stands, in `CRS` [m]."""
+"""Position of the static target in `CRS` [m]."""
 
 _GPS_AHEAD_S = 18.0
 _GPS_START = datetime(1980, 1, 6, tzinfo=UTC)
 _JPEG_QUALITY = 94
-_LOCAL = timedelta(hours=2)  # of the drone's clock, which names no zone
+_LOCAL = timedelta(hours=2)  # offset of the drone's clock, which states no time zone
 _XMP_MARK = b"http://ns.adobe.com/xap/1.0/\0"
 _ENU_FROM_LEVEL_PLATE = np.diag([1.0, -1.0, -1.0])  # x east, y south, z down
 _POS_COLUMNS = (
@@ -55,22 +55,22 @@ _POS_COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class DroneCamera:
-    """What a drone writes beside its pixels."""
+    """Metadata that a drone writes to its photos."""
 
     model: str
-    has_calibration: bool  # DewarpData
+    has_calibration: bool  # whether photos have DewarpData
     focal_35_mm: int
 
 
 Render = Callable[[FlightPlan, int], GreyArray]
-"""Makes the grey values of a frame."""
+"""Function that returns the grey values of a frame."""
 
 FACTORY_CALIBRATED = DroneCamera("M3E", has_calibration=True, focal_35_mm=55)
 CONSUMER = DroneCamera("FC0000", has_calibration=False, focal_35_mm=55)
 
 
 def plan(frames: int, seed: int) -> FlightPlan:
-    """Return a flight over a driving vehicle, all frames with the target at 10 to 45 m."""
+    """Return a flight over a driving vehicle; all frames show the target, at 10 to 45 m."""
     settings = replace(
         preset("sample"),
         frames=frames,
@@ -104,7 +104,7 @@ def _ground(seed: int) -> Ground:
 def write_dji_folder(
     folder: Path, flight: FlightPlan, first_number: int = 1, render: Render = rendered
 ) -> None:
-    """Write a folder of a DJI drone with its MRK file, and the rover's `.pos` beside the frames."""
+    """Write a folder of a DJI drone with its MRK file and the rover's `.pos`."""
     folder.mkdir(parents=True)
     moments = [datetime.fromtimestamp(time_s, UTC) + _LOCAL for time_s in flight.recorded_times_s]
     names = [
@@ -129,14 +129,14 @@ def write_sbet_folder(folder: Path, flight: FlightPlan, render: Render = rendere
 
 
 def write_static_folder(folder: Path, flight: FlightPlan, render: Render = rendered_static) -> None:
-    """Write frames of a consumer drone over a target that stands on the ground, and no more."""
+    """Write frames of a consumer drone over a static target on the ground, and no other files."""
     folder.mkdir(parents=True)
     names = [f"DJI_{1 + index:04d}.JPG" for index in range(len(flight.frames))]
     _write_frames(folder, _over_static_target(flight), names, CONSUMER, render)
 
 
 def _over_static_target(flight: FlightPlan) -> FlightPlan:
-    """Return the flight with every camera brought over one place, on which the plate lies level."""
+    """Return the flight with every camera moved over one place, where the plate lies level."""
     place = LocalFrame.at(CRS, ORIGIN_MAP).enu_from_map(STATIC_MAP[None])[0]
     frames = []
     for frame in flight.frames:
@@ -209,7 +209,7 @@ def _xmp(camera: Camera, drone: DroneCamera, relative_m: float) -> bytes:
 
 
 def with_xmp(jpeg: bytes, xmp: bytes) -> bytes:
-    """Return a JPEG with a segment of XMP."""
+    """Return a JPEG with an XMP segment added."""
     payload = _XMP_MARK + xmp
     return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(payload) + 2) + payload + jpeg[2:]
 

@@ -1,9 +1,9 @@
-"""Four first flights, from bare files to exports: the commands, their output, and what was edited.
+"""Four first flights, from bare files to exports: commands, their output, and edited lines.
 
     python -m benchmarks.first_flight.runs
 
-prints the transcripts that docs/first_flight_runs.md shows; `--write` renews that page. A run may
-have five commands and ten edited lines.
+This prints the transcripts of docs/first_flight_runs.md; `--write` writes that page anew. A run may
+have at most five commands and ten edited lines.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ rendered; the files beside them have the formats of DJI, RTKLIB, POSPac and Open
 
 @dataclass(frozen=True, slots=True)
 class Edit:
-    """Lines of a flight.toml that the user fills in: the key that stands there as a comment."""
+    """Lines of a flight.toml that the user fills in; the draft has their keys in comments."""
 
     file: str
     lines: Mapping[str, str]  # key → value as TOML
@@ -58,19 +58,19 @@ class Edit:
 
 @dataclass(frozen=True, slots=True)
 class FirstFlight:
-    """One first flight."""
+    """One first flight, as a recipe."""
 
     title: str
     about: str
     make: Callable[[Path], None]  # writes the bare files into the current folder
     steps: tuple[str | Edit, ...]
-    results: tuple[str, ...]  # files that must be there in the end
-    points: Mapping[str, int]  # table → number of points
+    results: tuple[str, ...]  # files that must exist at the end
+    points: Mapping[str, int]  # table → expected number of points
 
 
 @dataclass(frozen=True, slots=True)
 class Transcript:
-    """What was typed, edited and printed."""
+    """Transcript of a run: commands, edits and output."""
 
     text: str
     commands: int
@@ -80,7 +80,7 @@ class Transcript:
 def first_flights(
     moving: Render = rendered, static: Render = rendered_static
 ) -> Iterator[FirstFlight]:
-    """Yield the four flights, their frames made by some function."""
+    """Yield the four flights; the functions render frames with moving and static targets."""
     yield FirstFlight(
         "DJI drone with Timestamp.MRK, rover with RTKLIB",
         "The card's folder with `rover.pos` copied into it. The frames have DewarpData.",
@@ -153,12 +153,12 @@ def _write_two(folder: Path, render: Render) -> None:
 
 
 def run(flight: FirstFlight, folder: Path) -> Transcript:
-    """Run a first flight in an empty folder and return what it took.
+    """Run a first flight in an empty folder, and return its transcript.
 
     Raises
     ------
     AssertionError
-        If a command fails, a result is missing, or it took more than it may.
+        If a command fails, a result is missing, or there are too many commands or edited lines.
     """
     flight.make(folder)
     parts, commands, edited = [], 0, 0
@@ -230,7 +230,7 @@ def page_of(transcripts: Mapping[str, tuple[str, Transcript]]) -> str:
 def main() -> None:
     """Run all flights and print their transcripts, or write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--write", action="store_true", help="renew docs/first_flight_runs.md")
+    parser.add_argument("--write", action="store_true", help="write docs/first_flight_runs.md anew")
     arguments = parser.parse_args()
     transcripts = {}
     for flight in first_flights():

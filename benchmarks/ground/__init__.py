@@ -1,1 +1,1 @@
-"""Targets on the ground: placing them, and orienting frames by them."""
+"""Targets on the ground: their positions, and poses of frames that show them."""

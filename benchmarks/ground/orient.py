@@ -1,10 +1,11 @@
-"""Frames oriented from points with wrong names among them: right poses and stated deviations.
+"""Poses of frames from points, some of which have wrong names: share of right poses, and z.
 
-One line per number of points, with and without distances by the images' sizes. A pose is right if
-its squared error over its covariance is one that chance allows. The last line is of EO devices.
+There is one line per number of points, with and without distances from the sizes of the images. A
+pose is right if χ² of its errors is within what chance allows. The last line is for EO devices.
 
-With `--readout`, a rolling shutter reads the frames while the camera shifts and turns, each so much
-as `motion_sd_deg_s` says that the scene turns; the pose is that of the middle row.
+With `--readout`, a rolling shutter reads the frames while the camera turns and shifts. Both motions
+make the scene turn at rates with the standard deviation `motion_sd_deg_s`. The pose is that of the
+middle row.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _CAMERA = Camera(1600, 1200, 2300.0, 2300.0, 803.2, 596.1, k1=-0.05)
 _HEIGHT_M = 30.0
 _SD_PX, _SD_POSITION_M, _SD_DISTANCE = 0.05, 0.005, 5e-4
 _WRONG = 0.3  # share of wrong names
-_RIGHT_CHI2 = 50.0  # of six numbers: beyond it once in a hundred million times
+_RIGHT_CHI2 = 50.0  # limit for six numbers; chance exceeds it once in a hundred million times
 _POINTS = (3, 4, 5, 6, 8, 12, 20, 30)
 _LEAST_RIGHT = 0.999
 _NUMBERS = re.compile(r"\d+(\.\d+)?")
@@ -42,7 +43,7 @@ _SD_FOCAL, _LEAST_DEVICES = 0.2, 0.995
 DEVICE_M: FloatArray = np.array(
     [[0.0, 0.0, 0.0], [0.30, 0.0, 0.0], [0.05, 0.22, 0.0], [0.26, 0.19, 0.0], [0.14, 0.08, 0.12]]
 )
-"""Four points in a plane and one above it, without a symmetry."""
+"""Four points in a plane and one above it, without symmetry."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,22 +58,22 @@ class Setup:
 
     @property
     def camera(self) -> Camera:
-        """The camera, with its shutter."""
+        """The camera, with its readout time."""
         return replace(_CAMERA, readout_s=self.readout_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """What became of the frames of one setup."""
+    """Results of the frames of one setup."""
 
     setup: Setup
-    refused: Counter[str]  # by reason, without its numbers
+    refused: Counter[str]  # frames by reason, without the numbers in it
     wrong: int
     z: FloatArray  # (n, 6): standardised errors of right poses
 
     @property
     def right_share(self) -> float:
-        """Right poses among those that were given."""
+        """Share of right poses among all poses."""
         given = len(self.z) + self.wrong
         return len(self.z) / given if given else math.nan
 
@@ -90,7 +91,7 @@ def _true_pose(rng: np.random.Generator) -> CameraPose:
 
 
 def _scene(setup: Setup, rng: np.random.Generator) -> tuple[CameraPose, PointImages]:
-    """Draw a frame: points on nearly flat or rough ground, some of them under another's name."""
+    """Draw a random frame: points on nearly flat or rough ground, some with wrong names."""
     count, pose = setup.points, _true_pose(rng)
     places = np.column_stack(
         (
@@ -125,7 +126,7 @@ def _scene(setup: Setup, rng: np.random.Generator) -> tuple[CameraPose, PointIma
 def _seen(
     camera: Camera, pose: CameraPose, points_m: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Return points (n, 3) in the camera frame, each at the moment of its row."""
+    """Return points (n, 3) in the camera frame, each at the time of its row."""
     seen = pose.in_camera(points_m)
     if not camera.readout_s:
         return seen
@@ -181,7 +182,7 @@ def line(outcome: Outcome) -> str:
 
 
 def total_line(outcomes: Sequence[Outcome]) -> str:
-    """Return the share of right poses in all frames together."""
+    """Return the share of right poses in all frames, in words."""
     right = sum(len(outcome.z) for outcome in outcomes)
     wrong = sum(outcome.wrong for outcome in outcomes)
     refused = sum((outcome.refused for outcome in outcomes), Counter())
@@ -197,7 +198,13 @@ def total_line(outcomes: Sequence[Outcome]) -> str:
 
 
 def measure_devices(count: int, seed: int = 0) -> str:
-    """Orient cameras whose focal length is known to 20 % by a device of five points, in a line."""
+    """Orient cameras, whose focal length is known to 20 %, by a device of five points.
+
+    Returns
+    -------
+    str
+        A line of text.
+    """
     rng = np.random.default_rng([seed, 5])
     camera = Camera(1600, 1200, 2300.0, 2300.0, 799.5, 599.5)
     right = refused = wrong = 0
@@ -238,9 +245,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Print a line per number of points."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--frames", type=int, default=300, help="per line")
+    parser.add_argument("--frames", type=int, default=300, help="frames per line")
     parser.add_argument("--points", type=int, nargs="*", default=_POINTS)
-    parser.add_argument("--readout", type=float, default=0.0, help="of a rolling shutter [s]")
+    parser.add_argument(
+        "--readout", type=float, default=0.0, help="readout time of a rolling shutter [s]"
+    )
     parser.add_argument("--devices", type=int, default=400, help="frames with an EO device")
     options = parser.parse_args(arguments)
     setups = [

@@ -1,4 +1,4 @@
-"""Circles placed from rendered images: errors of normal, radius and place, and stated deviations.
+"""Circles placed from rendered images: errors of normal, radius and centre, and their z.
 
 Three experiments after Otepka & Fraser (2004): discs on a level table (their table 1), discs on a
 sine surface (table 2), and kgcp's coded ring in a simulated flight.
@@ -37,7 +37,7 @@ from kgcp.simulation.presets import preset
 
 # diameter in the image [px] → mean angle error on photographs [deg], by table 1 of 2004
 TABLE_1 = {13.2: 0.43, 8.6: 0.57, 7.1: 1.09, 4.2: 3.06}
-_SHARE = 0.5  # of these errors, that must be reached
+_SHARE = 0.5  # goal, relative to these errors
 _IMAGES = 8
 _COLUMNS, _ROWS = 8, 8
 _TABLE_CAMERA = Camera(1000, 800, 2000.0, 2000.0, 503.2, 396.4, k1=-0.06)
@@ -50,10 +50,10 @@ _RING_PX, _RING_FRAMES = 26.0, 24
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placings:
-    """Placed circles against their truth."""
+    """Comparison of placed circles with their truth."""
 
     angle_deg: FloatArray  # (n,)
-    z: FloatArray  # (n, 6): errors over own standard deviations
+    z: FloatArray  # (n, 6): errors over their stated standard deviations
     errors: FloatArray  # (n, 6)
     sds: FloatArray  # (n, 6)
     missed: int
@@ -66,7 +66,7 @@ class Placings:
 def _camera_poses(
     count: int, distance_m: float, tilt_deg: tuple[float, float], rng: np.random.Generator
 ) -> list[Pose]:
-    """Return poses of a level field, field → camera, seen from all sides."""
+    """Return poses, field → camera, of a level field that is seen from all sides."""
     poses = []
     for index in range(count):
         azimuth = 2.0 * math.pi * index / count + rng.normal(0.0, 0.1)
@@ -87,7 +87,7 @@ def _camera_poses(
 def _photographed(
     camera: Camera, poses: Sequence[Pose], discs: Sequence[SimulatedDisc], rng: np.random.Generator
 ) -> list[list[Disc | None]]:
-    """Return by photograph the measured disc that lies where each one must; None: not found."""
+    """Return the measured discs of each photograph, in the order of `discs`; None: not found."""
     cv2.setNumThreads(1)
     scene = FieldScene(tuple(discs), ground=0.75, ink=0.08, gradient=(1e-4, -5e-5))
     images = []
@@ -167,7 +167,7 @@ def sine_surface(seed: int = 0) -> tuple[Placings, float]:
     -------
     placings : Placings
     naive_m : float
-        RMS error per coordinate of places by the rays of the ellipses' centres.
+        RMS error per coordinate of points intersected from the centres of the ellipses.
     """
     rng, camera = np.random.default_rng([seed, 2]), _SINE_CAMERA
     diameter_m = _SINE_DIAMETER_PX * _SINE_DISTANCE_M / camera.fx
@@ -210,7 +210,7 @@ def _intersected(camera: Camera, views: CircleViews) -> FloatArray:
 
 
 def coded_ring(seed: int, frames: int = _RING_FRAMES) -> Placings:
-    """Place kgcp's ring from frames of a simulated flight; the plate itself is the world."""
+    """Place kgcp's ring from frames of a simulated flight, in the frame of the plate."""
     settings = replace(preset("clean"), frames=3 * frames, absent_share=0.0, decoy_share=0.0)
     plan, ground = plan_flight(settings, seed), grow_ground(seed)
     target, camera = TARGET_PLATE.target, settings.camera
@@ -290,7 +290,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--only", choices=["table", "sine", "ring"])
     parser.add_argument("--rings", type=int, default=2, help="simulated flights of the ring")
-    parser.add_argument("--seed", type=int, default=0, help="of the tables")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the two tables")
     options = parser.parse_args(arguments)
     experiments = [f"table {size} {options.seed}" for size in TABLE_1] + [f"sine {options.seed}"]
     experiments += [f"ring {seed}" for seed in range(options.rings)]

@@ -1,9 +1,10 @@
-"""Plain discs and rings in frames: found, taken for others, errors over bound and deviations.
+"""Plain discs and rings in frames: detection, errors over bound and standard deviations.
 
-Two experiments. Targets are rendered into pieces of photographs of ground (`--real`; without them,
-into the simulator's ground) at known places, and looked for with predictions that are off by 4 px.
-And they are looked for in the photographs as they are, which have none: at random places, and at
-round things of another size. benchmarks/README.md explains the columns.
+There are two experiments. In the first, targets are rendered at known places into pieces of
+photographs of ground (`--real`; without it, into the simulator's ground), and searched for with
+predictions that are off by 4 px. In the second, targets are searched for in the unchanged
+photographs, which have none: at random places, and at round things of another size.
+benchmarks/README.md explains the columns.
 """
 
 from __future__ import annotations
@@ -43,17 +44,17 @@ from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster
 from kgcp.simulation.plate import PlainPlate, image_plate
 from kgcp.targets.plain import PlainPolarity, PlainTarget
 
-SD_PX = 4.0  # of the predictions
+SD_PX = 4.0  # standard deviation of the predictions
 _SD_LOG, _SD_NORMAL_DEG = 0.003, 3.0
 _CAMERA = Camera(320, 320, 1500.0, 1500.0, 159.5, 159.5, k1=-0.3, response=Response.LINEAR)
-_MARGIN_PX = 70.0  # of targets against the frame's border
+_MARGIN_PX = 70.0  # least distance of targets from the frame's border
 _OPTICS, _SENSOR = Optics(0.6), Sensor()
 _BORDER_PX = 9.0
 _RADII_PX = (2.5, 3.0, 4.0, 6.0, 10.0, 20.0)
 _TILTS_DEG = (0.0, 12.5, 25.0, 37.5, 50.0)
 _DIAMETER_M = 0.5
-_APART_PX = AROUND_PX  # edges of a ring: farther apart, each has pixels of its own
-_EVEN = 0.2  # scatter of the ground about a bare disc, of the contrast, at most
+_APART_PX = AROUND_PX  # distance of a ring's edges from which each has pixels of its own
+_EVEN = 0.2  # largest scatter of the ground around a bare disc, relative to the contrast
 _BRIGHT, _DARK = 0.7, 0.06
 _KINDS = {  # shape, polarity, and whether it has a border
     "white disc": ((1.0,), PlainPolarity.BRIGHT, True),
@@ -61,16 +62,16 @@ _KINDS = {  # shape, polarity, and whether it has a border
     "black ring": ((1.0, 0.5), PlainPolarity.DARK, True),
     "bare white disc": ((1.0,), PlainPolarity.BRIGHT, False),
 }
-_SECTOR_PIXELS = 150  # of ground, to tell its texture
-_PHOTOGRAPH_NOISE = 0.3 / 255.0  # at least, of the photographs' pixels, to tell their texture
-_FOCAL = 0.85  # of the photographs' width
-_OTHER_SIZES = (0.6, 0.75, 1.3, 1.6)  # of the wanted target, against a round thing's
+_SECTOR_PIXELS = 150  # pixels of ground from which its texture is learned
+_PHOTOGRAPH_NOISE = 0.3 / 255.0  # least noise of the photographs' pixels, for their texture
+_FOCAL = 0.85  # focal length, relative to the photographs' width
+_OTHER_SIZES = (0.6, 0.75, 1.3, 1.6)  # size of the wanted target over that of the round thing
 _SMALLEST_PX, _LARGEST_PX = 4.0, 25.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Looks:
-    """What became of one kind of target at one radius."""
+class SearchResult:
+    """Results of the search for one kind of target at one radius."""
 
     kind: str
     radius_px: float
@@ -79,7 +80,7 @@ class Looks:
     wrong: int
     errors_px: FloatArray  # (n, 2)
     sds_px: FloatArray  # (n, 2)
-    bounds_px: FloatArray  # (n,): per coordinate
+    bounds_px: FloatArray  # (n,): bounds per coordinate
     z_distance: FloatArray  # (n,)
     along_tilt_px: FloatArray  # (n,): errors in the direction of the tilt
     tilts_deg: FloatArray  # (n,)
@@ -87,17 +88,17 @@ class Looks:
 
     @property
     def found(self) -> float:
-        """Share that was measured at its place."""
+        """Share of the targets that were measured at their places."""
         return len(self.errors_px) / self.shown
 
     @property
     def over_bound(self) -> float:
-        """RMS of the centre over that of the bound."""
+        """RMS of the centre's errors divided by that of the bounds."""
         return float(np.sqrt(np.mean(self.errors_px**2) / np.mean(self.bounds_px**2)))
 
     @property
     def trend(self) -> tuple[float, float]:
-        """Error along the tilt's direction per degree of tilt, in px, and its deviation."""
+        """Error along the tilt per degree of tilt [px], and its standard deviation."""
         tilt, error = self.tilts_deg, self.along_tilt_px
         square = float(tilt @ tilt)
         slope = float(tilt @ error) / square
@@ -106,9 +107,9 @@ class Looks:
 
 
 def target_of(kind: str, radius_px: float, *, is_free: bool = False) -> PlainTarget:
-    """Return a target; its border is as wide in the image as it takes.
+    """Return a target with this radius in the image; its normal is level, or free.
 
-    Its normal is level, or free.
+    A border has the width that the measurement needs.
     """
     shares, polarity, has_border = _KINDS[kind]
     border_m = 0.5 * _DIAMETER_M * _BORDER_PX / radius_px if has_border else None
@@ -119,7 +120,7 @@ def target_of(kind: str, radius_px: float, *, is_free: bool = False) -> PlainTar
     )
 
 
-def look(
+def search_rendered(
     kind: str,
     radius_px: float,
     count: int,
@@ -128,10 +129,11 @@ def look(
     *,
     is_free: bool = False,
     draw: int = 0,
-) -> Looks:
-    """Render so many targets of one kind and look for them.
+) -> SearchResult:
+    """Render a number of targets of one kind, and search for them.
 
-    A tone curve is not known; nor is the normal, if it is free. Each draw has other places.
+    If there is a tone curve, the measurement does not know it. If the normal is free, it is not
+    known either. Each draw has other places.
     """
     camera, sensor = _CAMERA, _SENSOR
     if tone is not None:
@@ -175,7 +177,7 @@ def look(
         z_distance.append(off_m / outcome.uncertainty.sd_distance_m)
         along.append(float(error @ uphill_px))
         tilts.append(tilt_deg)
-    return Looks(
+    return SearchResult(
         kind,
         radius_px,
         count,
@@ -192,7 +194,7 @@ def look(
 
 
 def _is_even(light: FloatArray, camera: Camera, pose: Pose, radius_px: float) -> bool:
-    """Tell whether the ground about a bare disc lets its edge show."""
+    """Tell whether the ground around a bare disc is even enough to show its edge."""
     x, y = camera.project(pose.translation_m[None])[0]
     rows, columns = np.indices(light.shape)
     off_px = np.hypot(columns - x, rows - y) - radius_px
@@ -222,7 +224,7 @@ def _placed(
     tilt_deg: float,
     rng: np.random.Generator,
 ) -> tuple[Pose, FloatArray, FloatArray]:
-    """Return a pose, the direction of its tilt in the image, and the normal that is stated."""
+    """Return a pose, the direction of its tilt in the image, and the normal as stated."""
     ray = _ray(camera, rng.uniform(_MARGIN_PX, camera.width - _MARGIN_PX, 2))
     distance_m = camera.fx * target.radii_m[0] / radius_px
     around = rng.uniform(0.0, 2.0 * math.pi)
@@ -260,12 +262,12 @@ def _prediction(
 def _edge_covs(
     kind: str, radius_px: float, ground: float | None = None, texture: GroundTexture | None = None
 ) -> FloatArray:
-    """Return the least covariances (k, 5, 5) of the circles' centres and stretches [px²].
+    """Return the smallest covariances (k, 5, 5) of the circles' centres and stretches [px²].
 
-    By the bound of the centre: an edge that is displaced by cos φ tells the centre, by cos² φ the
-    first element of the stretch, and so on, all by the same information per length. Of a ring
-    whose edges are near to each other, the inner circle moves and grows with the outer one. Those
-    that are far apart count as if they knew nothing of each other.
+    They follow from the bound of the centre: an edge displaced by cos φ determines the centre, one
+    displaced by cos² φ the first element of the stretch, and so on, all with the same information
+    per length. If the edges of a ring are close to each other, the inner circle moves and grows
+    with the outer one. Edges that are far apart are treated as independent.
     """
     shares, polarity, _ = _KINDS[kind]
     camera = Camera(81, 81, 200_000.0, 200_000.0, 40.0, 40.0)
@@ -275,7 +277,7 @@ def _edge_covs(
     angle = np.linspace(0.0, 2.0 * math.pi, 360, endpoint=False)
     c, s = np.cos(angle), np.sin(angle)
     moved = np.stack((c, s, c * c, 2.0 * c * s, s * s))
-    pattern = np.linalg.inv(moved @ moved.T / 180.0)  # the centre's has the variance 1
+    pattern = np.linalg.inv(moved @ moved.T / 180.0)  # normalised to a variance of 1 for the centre
     outer_m, *inner_m = (2.0 * share * radius_px / camera.fx for share in shares)
     if radius_px * (1.0 - min(shares)) < _APART_PX:
         discs = [SimulatedDisc((0.0, 0.0, 0.0), outer_m, sum(inner_m))]
@@ -294,7 +296,8 @@ def _edge_covs(
 def _bound_px(target: PlainTarget, edges: FloatArray, pose: Pose, prior: NormalPrior) -> float:
     """Return the bound of the true centre per coordinate [px].
 
-    Of the edges, and of the normal: what its prior leaves open, and which of both it is.
+    It includes the uncertainty of the edges, that of the normal after its prior, and that of the
+    choice between the two normals.
     """
     radii = np.array(target.radii_m[: len(edges)])
     moments = circle_images(_CAMERA, circles_about(pose, radii)).moments
@@ -313,7 +316,7 @@ def _bound_px(target: PlainTarget, edges: FloatArray, pose: Pose, prior: NormalP
 
 
 def pieces_of_ground(photographs: Sequence[GreyArray], count: int) -> list[FloatArray]:
-    """Return the light of pieces of photographs; without any, of the simulator's ground."""
+    """Return the light of pieces of photographs, or of the simulator's ground if none."""
     rng = np.random.default_rng(5)
     size = _CAMERA.height
     if not photographs:
@@ -332,13 +335,13 @@ def pieces_of_ground(photographs: Sequence[GreyArray], count: int) -> list[Float
 
 
 def _linear(photograph: GreyArray) -> FloatArray:
-    """Return the light of a photograph, about: its tone curve is near to sRGB's."""
+    """Return the approximate light of a photograph, whose tone curve is close to sRGB's."""
     return np.asarray((photograph / 255.0) ** 2.2)
 
 
 @dataclass(frozen=True, slots=True)
 class Windows:
-    """Windows of photographs that have no target."""
+    """Results of the search in windows of photographs without targets."""
 
     name: str
     windows: int
@@ -354,28 +357,28 @@ def random_windows(
     *,
     is_free: bool = False,
 ) -> Windows:
-    """Look for targets of all kinds and sizes where there is none."""
+    """Search for targets of all kinds and sizes at random places without a target."""
     rng = np.random.default_rng(seed)
     places = _random_places(photographs, count, sizes_px, rng)
-    return _looked_at("random places", photographs, places, is_free=is_free)
+    return _searched("random places", photographs, places, is_free=is_free)
 
 
 def round_things(photographs: Sequence[GreyArray], most: int, *, is_free: bool = False) -> Windows:
-    """Look for targets at wheels, manholes, tanks and stones that have another size."""
+    """Search for targets at round things of another size: wheels, manholes, tanks and stones."""
     places = _round_places(photographs, most)
-    return _looked_at("round things", photographs, places, is_free=is_free)
+    return _searched("round things", photographs, places, is_free=is_free)
 
 
 def edges_alike(photographs: Sequence[GreyArray]) -> FloatArray:
-    """Return how many edges of a level disc's size and shape a window has by chance.
+    """Return the expected number of edges with a level disc's size and shape in a window.
 
-    Before they are measured: their density in the whole photograph, times the area in which a
-    target is looked for. A test against chance would have to refuse targets where this is large.
+    It is their density in the whole photograph, before they are measured, times the area that is
+    searched for a target. A test against chance would have to refuse targets if this is large.
 
     Returns
     -------
     (photographs, radii) array
-        Of the polarity that has more of them, for `_RADII_PX`.
+        Numbers for `_RADII_PX`, of the polarity that has more edges.
     """
     window_px2 = math.pi * (SIGMAS * SD_PX) ** 2
     shares = []
@@ -431,7 +434,7 @@ def _round_places(photographs: Sequence[GreyArray], most: int) -> Iterator[_Plac
             yield index, outline.ellipse.centre, radius_px, kinds[number % len(kinds)]
 
 
-def _looked_at(
+def _searched(
     name: str, photographs: Sequence[GreyArray], places: Iterator[_Place], *, is_free: bool
 ) -> Windows:
     rng = np.random.default_rng(7)
@@ -464,26 +467,27 @@ def _looked_at(
             wrong += 1
             x, y = outcome.centre_px
             print(
-                f"  taken for a {kind}: photograph {index}, ({x:.0f}, {y:.0f}), R {radius_px:.1f}"
+                f"  mistaken for a {kind}: photograph {index}, ({x:.0f}, {y:.0f}),"
+                f" R {radius_px:.1f}"
             )
         else:
             reasons[outcome.reason.value] += 1
     return Windows(name, windows, wrong, reasons)
 
 
-def print_looks(looks: Looks) -> None:
+def print_result(result: SearchResult) -> None:
     """Print a line of the first experiment."""
-    line = f"{looks.kind:16} {looks.radius_px:5.1f} {100.0 * looks.found:6.1f} {looks.wrong:5}"
-    if len(looks.errors_px):
-        slope, sd = looks.trend
-        rms = float(np.sqrt(np.mean(looks.errors_px**2)))
-        z = float(np.sqrt(np.mean((looks.errors_px / looks.sds_px) ** 2)))
-        z_distance = float(np.sqrt(np.mean(looks.z_distance**2)))
+    line = f"{result.kind:16} {result.radius_px:5.1f} {100.0 * result.found:6.1f} {result.wrong:5}"
+    if len(result.errors_px):
+        slope, sd = result.trend
+        rms = float(np.sqrt(np.mean(result.errors_px**2)))
+        z = float(np.sqrt(np.mean((result.errors_px / result.sds_px) ** 2)))
+        z_distance = float(np.sqrt(np.mean(result.z_distance**2)))
         line += (
-            f" {rms:8.4f} {looks.over_bound:6.2f} {z:5.2f} {z_distance:6.2f}"
-            f" {1e3 * slope:7.4f} ± {1e3 * sd:.4f} {looks.ms:6.0f}"
+            f" {rms:8.4f} {result.over_bound:6.2f} {z:5.2f} {z_distance:6.2f}"
+            f" {1e3 * slope:7.4f} ± {1e3 * sd:.4f} {result.ms:6.0f}"
         )
-    print(line, dict(looks.reasons) or "", flush=True)
+    print(line, dict(result.reasons) or "", flush=True)
 
 
 @single_threaded()
@@ -492,17 +496,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--real", type=Path, help="folder of photographs of ground")
     parser.add_argument("--count", type=int, default=40, help="targets per line")
-    parser.add_argument("--draw", type=int, default=0, help="another draw of targets")
+    parser.add_argument("--draw", type=int, default=0, help="number of the random draw of targets")
     parser.add_argument("--windows", type=int, default=2000)
-    parser.add_argument("--seed", type=int, default=11, help="of the windows")
+    parser.add_argument("--seed", type=int, default=11, help="seed of the windows")
     parser.add_argument(
-        "--sizes", type=float, nargs=2, default=(_SMALLEST_PX, _LARGEST_PX), help="in windows [px]"
+        "--sizes",
+        type=float,
+        nargs=2,
+        default=(_SMALLEST_PX, _LARGEST_PX),
+        help="range of radii of the targets in the second experiment [px]",
     )
     parser.add_argument(
-        "--tone", choices=[*ToneCurve], type=ToneCurve, help="a tone curve that is not known"
+        "--tone",
+        choices=[*ToneCurve],
+        type=ToneCurve,
+        help="tone curve that the measurement does not know",
     )
     parser.add_argument("--kind", choices=[*_KINDS], action="append")
-    parser.add_argument("--free", action="store_true", help="normals are not known at all")
+    parser.add_argument("--free", action="store_true", help="normals are unknown")
     chosen = parser.parse_args(arguments)
     photographs = []
     if chosen.real is not None:
@@ -513,8 +524,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for kind in (chosen.kind or _KINDS) if chosen.count else ():
         for radius_px in _RADII_PX:
             if radius_px < smallest_radius_px(target_of(kind, radius_px, is_free=chosen.free)):
-                continue  # it is not looked for
-            looks = look(
+                continue  # kgcp does not search for such small targets
+            result = search_rendered(
                 kind,
                 radius_px,
                 chosen.count,
@@ -523,12 +534,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 is_free=chosen.free,
                 draw=chosen.draw,
             )
-            print_looks(looks)
+            print_result(result)
     if photographs and chosen.windows:
         for radius_px, shares in zip(_RADII_PX, edges_alike(photographs).T, strict=True):
             print(
                 f"edges of a disc's size and shape, R {radius_px:g} px: {shares.min():.1e} to"
-                f" {shares.max():.1e} in a window"
+                f" {shares.max():.1e} per window"
             )
         for windows in (
             random_windows(

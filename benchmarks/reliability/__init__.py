@@ -1,1 +1,1 @@
-"""Runs that are killed, that are long, and that must give the same bytes."""
+"""Tests of long runs, of runs that are killed, and of results that must be the same bytes."""

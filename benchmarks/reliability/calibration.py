@@ -1,7 +1,7 @@
-"""Kill `kgcp calibrate` and its workers at random moments, until it is done all the same.
+"""Kill `kgcp calibrate` and its workers at random moments, and repeat it until it is complete.
 
-All files must be, byte for byte, those of an undisturbed run, which in turn must be the same for
-any number of jobs. Linux only: it finds the workers in /proc.
+All files must be, byte for byte, those of an undisturbed run, which in turn must not depend on the
+number of jobs. Linux only, because it finds the workers in /proc.
 """
 
 from __future__ import annotations
@@ -59,13 +59,13 @@ def make_photos(folder: Path, count: int) -> Path:
 
 
 def calibrating(photos: Path, field: Path, out: Path, jobs: int) -> list[str]:
-    """Return the arguments of kgcp that calibrate the camera."""
+    """Return the arguments of kgcp to calibrate the camera."""
     options = ["--field", str(field), "--out", str(out), "--jobs", str(jobs), "--format", "opencv"]
     return ["calibrate", str(photos), *options]
 
 
 def hashes(out: Path) -> dict[str, str]:
-    """Return the hash of every file, hidden ones included."""
+    """Return the hash of every file, including hidden files."""
     return {
         str(path.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(out.rglob("*"))

@@ -1,9 +1,9 @@
-"""Process one small flight under many circumstances, and compare what was written byte by byte.
+"""Process one small flight under many circumstances, and compare the results byte by byte.
 
-The first table is of one machine with one set of packages: numbers of threads and of jobs, the
-order in which code is compiled, and whether it comes from the cache. All must be the same bytes.
-The second one makes the libraries choose as they would on other processors; there the largest
-difference of a measurement is given, in units of its reported standard deviation.
+The first table is for one machine with one set of packages. It varies the numbers of threads and of
+jobs, the order in which code is compiled, and whether it comes from the cache. All results must be
+the same bytes. The second table makes the libraries choose kernels as on other processors; it
+states the largest difference of a measurement in units of its reported standard deviation.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ for method in (Method.PAPER, Method.MODEL):
 
 
 def make_flight(folder: Path, frames: int) -> None:
-    """Write a flight of small consumer frames, some of which need a second look."""
+    """Write a flight of small consumer frames, some of which need the second pass."""
     consumer = preset("consumer")
     settings = replace(
         consumer,
@@ -69,19 +69,19 @@ def make_flight(folder: Path, frames: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Circumstances:
-    """How a flight is processed.
+    """Circumstances under which a flight is processed.
 
     Attributes
     ----------
     environment : mapping of str
-        Besides that of this process.
+        Variables in addition to those of this process.
     has_cluster : bool
-        Whether a Dask cluster of two workers on this machine measures, instead of jobs.
+        Whether a Dask cluster of two workers on this machine is used instead of jobs.
     is_library_call : bool
-        Whether detections are made by a program that has used numpy before.
+        Whether the detections are made by a program that has used numpy before.
     compiles_in_other_order : bool
-        Whether other frames, in the opposite order and by the other method first, are measured
-        before, with a cache that is empty then.
+        Whether, starting with an empty cache, the frames are first measured in the opposite order
+        and with the other method first.
     """
 
     name: str
@@ -93,7 +93,7 @@ class Circumstances:
 
 
 def one_machine(cache: Path) -> Iterator[Circumstances]:
-    """Yield circumstances that must not change a byte; the first one is the reference."""
+    """Yield circumstances that must not change any byte; the first is the reference."""
     for threads in ("1", "4"):
         environment = dict.fromkeys(_THREADS, threads)
         for jobs in (0, 1, 2):
@@ -111,7 +111,7 @@ def one_machine(cache: Path) -> Iterator[Circumstances]:
 
 
 def other_processors(cache: Path) -> Iterator[Circumstances]:
-    """Yield what makes libraries choose as on other processors; the first one is as on this one."""
+    """Yield circumstances as on other processors; the first is that of this processor."""
     for core, flag in _CORE_TYPES.items():
         if flag in processor_flags():
             yield Circumstances(f"OPENBLAS_CORETYPE={core}", 0, {"OPENBLAS_CORETYPE": core})
@@ -123,7 +123,7 @@ def other_processors(cache: Path) -> Iterator[Circumstances]:
 
 
 def processor_flags() -> set[str]:
-    """Return what this machine's processor can do, in the kernel's words; empty if not Linux."""
+    """Return the processor's flags as the kernel lists them; empty if this is not Linux."""
     if not Path("/proc/cpuinfo").exists():
         return set()
     for line in Path("/proc/cpuinfo").read_text(encoding="ascii").splitlines():
@@ -135,7 +135,7 @@ def processor_flags() -> set[str]:
 def process(
     flight: Path, out: Path, circumstances: Circumstances, *, only_detects: bool = False
 ) -> dict[str, str]:
-    """Detect, export and report; return the hash of every file that was written."""
+    """Detect, export and report; return the hashes of all files that were written."""
     environment = {**os.environ, **circumstances.environment}
 
     def call(*command: str) -> None:
@@ -165,7 +165,7 @@ def process(
 
 
 def largest_difference(one: Path, other: Path) -> float:
-    """Return the largest difference of a place or distance, of its standard deviation."""
+    """Return the largest difference of a distance, centre or angle over its standard deviation."""
     tables = [
         pd.read_parquet(out / "detections.parquet").set_index(["frame", "target", "instance"])
         for out in (one, other)
@@ -187,7 +187,7 @@ def largest_difference(one: Path, other: Path) -> float:
 
 
 def compare(flight: Path, place: Path, sets: Iterator[Circumstances]) -> int:
-    """Print a line for each of the circumstances; return how many wrote other bytes."""
+    """Print a line for each circumstance; return how many of them wrote other bytes."""
     reference: dict[str, str] = {}
     first, others = place, 0
     for number, circumstances in enumerate(sets):
@@ -211,7 +211,7 @@ def compare(flight: Path, place: Path, sets: Iterator[Circumstances]) -> int:
 @click.option("--frames", default=12, show_default=True, type=click.IntRange(6))
 @click.option("--processors/--no-processors", "has_processors", default=True, show_default=True)
 def main(frames: int, *, has_processors: bool) -> None:
-    """Process a simulated flight of small frames again and again; 1: other bytes on one machine."""
+    """Process a simulated flight repeatedly; exit with 1 if bytes differ on one machine."""
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         flight = place / "flight"

@@ -1,6 +1,6 @@
-"""Let `kgcp detect` run for long, and see whether its memory grows or its speed falls.
+"""Run `kgcp detect` for a long time, and measure whether memory grows or speed falls.
 
-Linux only: memory and CPU time of the processes are those of /proc.
+Linux only, because it reads memory and CPU time of the processes in /proc.
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ import click
 
 from benchmarks.reliability.torture import Life, detecting, make_flight
 
-_ABSENT = 0.8  # share of frames without a target, which are quick
+_ABSENT = 0.8  # share of frames without a target, which take little time
 _TURN_S = 1.0
-_WARM_UP = 0.05  # share of the frames, after which memory is to be flat
+_WARM_UP = 0.05  # share of the frames after which memory should no longer grow
 _TENTH = 0.1
 _MOST_GROWTH_MB = 20.0
 _LEAST_SPEED = 0.95
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 _MB_PER_PAGE = os.sysconf("SC_PAGE_SIZE") / 2**20
-_CPU_FIELDS = slice(11, 13)  # of /proc/PID/stat behind the name: user and system time
+_CPU_FIELDS = slice(11, 13)  # fields of /proc/PID/stat after the name: user and system time
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """How far a run is, and what it has taken.
+    """Progress of a run, and the time and memory that it has used.
 
     Attributes
     ----------
     done : int
-        Looks at frames.
+        Number of frames examined, counting those of the second pass again.
     is_looking : bool
-        Whether there are more; the table is made after them.
+        Whether frames remain to be examined; afterwards, the table is written.
     time_s, cpu_s : float
-        Of the clock, and of parent and workers together.
+        Wall time, and CPU time of parent and workers together.
     parent_mb, workers_mb : float
-        Resident memory of the parent, and of the largest worker.
+        Resident memory of the parent and of the largest worker.
     """
 
     done: int
@@ -53,13 +53,13 @@ class Sample:
 
 
 def samples(life: Life) -> Iterator[Sample]:
-    """Yield a sample per second, until the run has ended."""
+    """Yield one sample per second until the run has ended."""
     while not life.is_over:
         try:
             pids = [life.process.pid, *life.workers()]
             resident_mb = [_resident_mb(pid) for pid in pids]
             cpu_s = sum(map(_cpu_s, pids))
-        except OSError:  # it has ended just now
+        except OSError:  # it has just ended
             break
         if life.done:
             workers_mb = max(resident_mb[1:], default=0.0)
@@ -81,17 +81,17 @@ def _cpu_s(pid: int) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Speed:
-    """Frames per second, of the clock and of CPU time."""
+    """Frames per second of wall time and of CPU time."""
 
     per_s: float
     per_cpu_s: float
 
 
 def speed_between(taken: Sequence[Sample], first: float, last: float) -> Speed:
-    """Return the speed between two numbers of looks, by the nearest samples.
+    """Return the speed between two numbers of examined frames, from the nearest samples.
 
-    Only those count in which there were looks to come: later on, workers have ended, and their CPU
-    time is not seen any more.
+    Only samples before the end of the examination count: later, workers have ended, and their CPU
+    time can no longer be read.
     """
     looking = [sample for sample in taken if sample.is_looking]
     begin, end = (
@@ -107,7 +107,7 @@ def speed_between(taken: Sequence[Sample], first: float, last: float) -> Speed:
 def main(frames: int, jobs: int) -> None:
     """Print memory and speed, and exit with 1 if memory grows or the run becomes slower.
 
-    The speed that is judged is that of CPU time, which other programs on the machine do not change.
+    Speed is judged by CPU time, which does not depend on other programs of the machine.
     """
     with tempfile.TemporaryDirectory() as folder:
         flight = Path(folder) / "flight"
@@ -135,13 +135,13 @@ def main(frames: int, jobs: int) -> None:
     print(
         f"{frames} frames on {jobs} processes in {taken[-1].time_s - taken[0].time_s:.0f} s;"
         f" parent {warm[0].parent_mb:.0f} MB after {_WARM_UP:.0%}, then at most"
-        f" {growth_mb:+.1f} MB (wanted: {_MOST_GROWTH_MB:.0f}), {table_mb:+.1f} MB with the table;"
+        f" {growth_mb:+.1f} MB (limit: {_MOST_GROWTH_MB:.0f}), {table_mb:+.1f} MB with the table;"
         f" workers at most {max(sample.workers_mb for sample in taken):.0f} MB"
     )
     print(
         f"first tenth {first.per_cpu_s:.2f} frames per CPU second ({first.per_s:.2f} per second),"
         f" last tenth {last.per_cpu_s:.2f} ({last.per_s:.2f}): {ratio:.1%} of the first"
-        f" (wanted: {_LEAST_SPEED:.0%})"
+        f" (limit: {_LEAST_SPEED:.0%})"
     )
     sys.exit(growth_mb > _MOST_GROWTH_MB or ratio < _LEAST_SPEED)
 

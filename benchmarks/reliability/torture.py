@@ -1,6 +1,6 @@
-"""Kill `kgcp detect` and its workers at random moments, until it is done all the same.
+"""Kill `kgcp detect` and its workers at random moments, and repeat it until it is complete.
 
-The table must be, byte for byte, that of an undisturbed run. Linux only: it finds the
+The table must be, byte for byte, that of an undisturbed run. Linux only, because it finds the
 workers in /proc.
 """
 
@@ -31,32 +31,33 @@ from kgcp.simulation.flight import plan_flight
 from kgcp.simulation.presets import preset
 
 _BREAK_S = 1000.0
-_EARLY_S = 2.0  # in which a run starts
-_PAUSE_S = 0.3  # at most, between a frame and a kill
-_EARLY, _WORKER = 0.2, 0.5  # share of lives that end while they start, that lose a worker
-_ORPHAN_S = 20.0  # after which no worker may be left of a parent that was killed
+_EARLY_S = 2.0  # time in which a run starts
+_PAUSE_S = 0.3  # longest time between a frame and a kill
+_EARLY, _WORKER = 0.2, 0.5  # share of runs killed while they start; share that lose a worker
+_ORPHAN_S = 20.0  # time after which no worker of a killed parent may be left
 
 
 @dataclass(slots=True)
 class Toll:
-    """What a run was put through."""
+    """Number of kills, and of runs until the end."""
 
     parents: int = 0
     workers: int = 0
-    runs: int = 0  # that came to their end
+    runs: int = 0  # runs that ended by themselves
 
     @property
     def kills(self) -> int:
-        """All of them."""
+        """Number of all kills."""
         return self.parents + self.workers
 
 
 def make_flight(
     folder: Path, frames: int, jobs: int, *, absent_share: float = 0.1, rendered: int = 100
 ) -> None:
-    """Write a flight of small frames, some of which need a second look.
+    """Write a flight of small frames, some of which need the second pass.
 
-    Frames after the first `rendered` ones are links to these, later by a multiple of a break.
+    Frames after the first `rendered` ones are links to these; their times are later by a multiple
+    of `_BREAK_S`.
     """
     far = preset("far")
     settings = replace(
@@ -68,7 +69,7 @@ def make_flight(
         decoy_share=0.1,
     )
     write_simulated_flight(plan_flight(settings, 3), folder, jobs=jobs, on_frame=lambda: None)
-    (folder / "reference.csv").unlink()  # it names the first pass alone
+    (folder / "reference.csv").unlink()  # it names only the rendered frames
     names = sorted(path.name for path in (folder / "frames").iterdir())
     times = read_times(folder / "frames.csv", names).time_s
     lines = ["frame,time"]
@@ -84,12 +85,12 @@ def make_flight(
 
 
 def detecting(flight: Path, out: Path, jobs: int) -> list[str]:
-    """Return the arguments of kgcp that make a flight's table."""
+    """Return the arguments of kgcp to make a flight's table."""
     return ["detect", str(flight), "--out", str(out), "--jobs", str(jobs)]
 
 
 class Life:
-    """One process of kgcp, from its start to its end, whatever that is."""
+    """One process of kgcp, from its start to its end, by itself or by a kill."""
 
     def __init__(self, command: Sequence[str]) -> None:
         command = [sys.executable, "-m", "kgcp", *command, "--log-json"]
@@ -116,14 +117,14 @@ class Life:
                 self.done = self.total - event["total"] + event["done"]
 
     def workers(self) -> list[int]:
-        """Find the processes that work for it: its server's children, or its own."""
+        """Return the ids of its worker processes: children of its server, or its own."""
         children = children_of(self.process.pid)
         servers = [child for child in children if is_started_by(child, b"forkserver")]
         forked = [worker for server in servers for worker in children_of(server)]
         return forked + [child for child in children if is_started_by(child, b"spawn_main")]
 
     def wait_for(self, done: float, seconds: float) -> None:
-        """Wait until some number of frames is done, and some seconds more, at most to the end."""
+        """Wait until a number of frames is done, then some seconds more, but not beyond the end."""
         while not self.is_over and self.done < done:
             time.sleep(0.05)
         until = time.monotonic() + seconds
@@ -133,7 +134,7 @@ class Life:
     def end(self) -> int:
         """Wait for the end and return the exit code."""
         code = self.process.wait()
-        self._reader.join(timeout=_ORPHAN_S)  # its workers hold the other end
+        self._reader.join(timeout=_ORPHAN_S)  # its workers hold the other end of the pipe
         assert not self._reader.is_alive(), "workers have outlived their parent"
         assert self.process.stderr is not None
         self.process.stderr.close()
@@ -141,7 +142,7 @@ class Life:
 
 
 def children_of(pid: int) -> list[int]:
-    """Return the processes that one has started: every thread counts its own."""
+    """Return the children of a process; /proc lists them by the thread that started them."""
     children: list[str] = []
     for path in Path(f"/proc/{pid}/task").glob("*/children"):
         with suppress(OSError):  # the thread has just ended
@@ -158,7 +159,7 @@ def is_started_by(pid: int, function: bytes) -> bool:
 
 
 def live_and_die(life: Life, kills_left: int, rng: random.Random, toll: Toll) -> None:
-    """Let a run come some way, kill a worker of it, perhaps, and then the run."""
+    """Let a run work for some time, kill one of its workers perhaps, and then the run."""
     if rng.random() < _EARLY:
         life.wait_for(0, rng.uniform(0.0, _EARLY_S))
     else:
@@ -176,7 +177,7 @@ def live_and_die(life: Life, kills_left: int, rng: random.Random, toll: Toll) ->
 
 
 def kill(pid: int) -> None:
-    """End a process as the kernel does when memory is short."""
+    """Kill a process as the kernel does when memory is short."""
     try:
         os.kill(pid, signal.SIGKILL)
     except ProcessLookupError:
@@ -184,12 +185,12 @@ def kill(pid: int) -> None:
 
 
 def torture(command: Sequence[str], out: Path, kills: int, rng: random.Random) -> Toll:
-    """Run, kill and resume until all kills are done and the last run has come to its end.
+    """Run, kill and resume until all kills are done and the last run has ended.
 
     Raises
     ------
     RuntimeError
-        If a run fails, rather than being killed.
+        If a run fails without being killed.
     """
     toll = Toll()
     while True:
@@ -234,7 +235,7 @@ def main(frames: int, kills: int, jobs: int | None, seed: int) -> None:
         f" {journal_s:.1f} s ({100.0 * journal_s / undisturbed_s:.2f} %)"
     )
     print(
-        f"killed {toll.parents} times the run and {toll.workers} times a worker: done after"
+        f"killed the run {toll.parents} times and a worker {toll.workers} times: done after"
         f" {tortured_s:.0f} s (complete runs: {toll.runs})"
     )
     print("tables: byte-identical" if tables[0] == tables[1] else "tables: DIFFER")

@@ -2,8 +2,8 @@
 
 Usage: python -m benchmarks.speed.bias_report [--frames 5000]
 
-A simulated flight of 60 frames is rendered, measured, and repeated after itself, its distances
-with new noise, until there are enough frames; the report is then made by the command itself.
+A simulated flight of 60 frames is rendered and measured. Its frames and rows are then repeated,
+with new noise of the distances, until there are enough frames, and the command makes the report.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _MOST_S, _MOST_MB = 20.0, 15.0
 
 
 def repeat_flight(flight: Path, table: Path, frames: int) -> None:
-    """Append a flight to itself, shifted in time, until it has enough frames."""
+    """Append copies of a flight to itself, shifted in time, until it has enough frames."""
     times = pd.read_csv(flight / "frames.csv", parse_dates=["time"])
     vehicle = pd.read_csv(flight / "vehicle.csv", parse_dates=["time"])
     reference = pd.read_csv(flight / "reference.csv")
@@ -60,9 +60,9 @@ def repeat_flight(flight: Path, table: Path, frames: int) -> None:
 
 @click.command()
 @click.option("--frames", type=click.IntRange(_RENDERED), default=5000, show_default=True)
-@click.option("--keep", type=click.Path(path_type=Path), help="Where the report is kept.")
+@click.option("--keep", type=click.Path(path_type=Path), help="Folder in which to keep the report.")
 def main(frames: int, keep: Path | None) -> None:
-    """Print time and size; fail where they are above what a report may take."""
+    """Print time and size; fail if they are above the limits for a report."""
     with tempfile.TemporaryDirectory() as folder:
         flight = Path(folder) / "flight"
         out = keep or flight / "kgcp"

@@ -1,4 +1,4 @@
-"""CPU time of decoding, of the search and of the whole detection, frame by frame."""
+"""CPU time of decoding, of the search and of the complete detection, frame by frame."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from kgcp.measurement.search.candidates import find_rings
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
 
-if TYPE_CHECKING:  # what workers import decides about their memory
+if TYPE_CHECKING:  # imports at run time would add to the memory that is measured
     from benchmarks.speed.sources import Source
 
 Result = TypeVar("Result")
 
-_REPEATS = 3  # the least of them counts: whatever else the machine does only adds
+_REPEATS = 3  # the smallest counts, since other work of the machine only adds time
 HEADER = "set                     targets  frames   Mpx  decode ms   search   whole  median"
 
 
@@ -40,9 +40,9 @@ class FrameCost:
     Attributes
     ----------
     decode_s, search_s, measure_s : float
-        Of decoding the file; of the search for rings alone; of search and measurement.
+        Decoding the file; the search for rings alone; search and measurement together.
     found : int
-        Targets that were measured.
+        Number of targets that were measured.
     """
 
     pixels: int
@@ -54,12 +54,12 @@ class FrameCost:
 
 @dataclass(frozen=True, slots=True)
 class Costs:
-    """The frames of one line.
+    """The frames of one line of the table.
 
     Attributes
     ----------
     name, targets : str
-        Where they are from, and whether a target was measured in them.
+        Source of the frames, and whether a target was measured in them.
     """
 
     name: str
@@ -67,7 +67,7 @@ class Costs:
     frames: tuple[FrameCost, ...]
 
     def mean(self, value: Callable[[FrameCost], float]) -> float:
-        """Return the mean of something over the frames."""
+        """Return the mean of a value over the frames."""
         return sum(map(value, self.frames)) / len(self.frames)
 
     @property
@@ -77,27 +77,27 @@ class Costs:
 
     @property
     def search(self) -> float:
-        """Search, as a multiple of decoding."""
+        """CPU time of the search, divided by that of decoding."""
         return self.mean(lambda cost: cost.search_s) / self.decode_s
 
     @property
     def whole(self) -> float:
-        """Decoding, search and measurement, as a multiple of decoding."""
+        """CPU time of decoding, search and measurement, divided by that of decoding."""
         return 1.0 + self.mean(lambda cost: cost.measure_s) / self.decode_s
 
     @property
     def typical(self) -> float:
-        """The same of a typical frame: the median over the frames."""
+        """The same ratio for each frame: the median over the frames."""
         return 1.0 + median(cost.measure_s / cost.decode_s for cost in self.frames)
 
 
-def cv2_alone() -> None:
-    """Take OpenCV's threads away, as the workers of `kgcp detect` do."""
+def use_one_opencv_thread() -> None:
+    """Let OpenCV use one thread, as in the workers of `kgcp detect`."""
     cv2.setNumThreads(0)
 
 
 def peak_memory_bytes() -> int:
-    """Return this process's peak memory; on Linux, `getrusage` counts its parent's, too."""
+    """Return the peak memory of this process alone; on Linux, `getrusage` includes its parent's."""
     if sys.platform != "linux":
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     status = Path("/proc/self/status").read_text(encoding="ascii")
@@ -118,10 +118,10 @@ def cost_of(
     targets: tuple[Target, ...],
     priors: Mapping[str, PlatePrior] = MappingProxyType({}),
 ) -> FrameCost:
-    """Time what becomes of one frame, where so much is known of the targets before."""
+    """Time the steps of one frame; `priors` is what a run knows of the targets by then."""
     settings = DetectSettings()
     costs = []
-    for _ in range(_REPEATS):  # in turn: in a loop of its own, decoding is faster than in a run
+    for _ in range(_REPEATS):  # in turn, since decoding alone in a loop is faster than in a run
         decode_s, grey = _timed(partial(read_grey, path, camera))
         search_s, _ = _timed(partial(find_rings, grey, settings))
         measure_s, seen = _timed(partial(examine, grey, camera, targets, settings, priors))
@@ -144,7 +144,7 @@ def _timed(function: Callable[[], Result]) -> tuple[float, Result]:
 
 
 def cost_of_all(source: Source) -> Iterable[Costs]:
-    """Time the frames of a source; those with a measured target and those without stand apart."""
+    """Time the frames of a source, apart for those with and without a measured target."""
     flight = source.flight
     paths = [flight.frames_folder / name for name in source.frames]
     cost_of(paths[0], flight.camera, flight.targets)  # compiles
@@ -155,7 +155,7 @@ def cost_of_all(source: Source) -> Iterable[Costs]:
 
 
 def print_costs(sources: Iterable[Source], count: int) -> Iterable[FrameCost]:
-    """Print the lines of some sources, and return their frames; of each some, spread over it."""
+    """Print the lines of sources, and yield the costs of `count` frames spread over each."""
     for source in sources:
         for costs in cost_of_all(source.spread(count)):
             print(cost_line(costs), flush=True)

@@ -1,4 +1,4 @@
-"""Times of writing many KGCPs in all formats.
+"""Wall time of writing many KGCPs in all formats.
 
 Usage: python -m benchmarks.speed.exporters [--points 10000]
 """
@@ -25,7 +25,7 @@ _CAMERA = Camera(width=1600, height=1201, fx=2300.0, fy=2310.0, cx=801.3, cy=597
 
 
 def corridor(count: int) -> MapPoints:
-    """Return points along 10 m steps of a corridor, each with a prior of its frame."""
+    """Return points at steps of 10 m along a corridor, each with a camera prior of its frame."""
     rng = np.random.default_rng(1)
     places = _START + np.outer(np.arange(count), [1.0, 0.5, 0.01])
     gcps = tuple(
@@ -65,7 +65,7 @@ def time_formats(count: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Print the times; fail where all together take too long."""
+    """Print the times; fail if all formats together take too long."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--points", type=int, default=10_000)
     count = parser.parse_args().points

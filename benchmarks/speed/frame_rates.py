@@ -1,4 +1,4 @@
-"""Frames per second of `kgcp detect` on one machine, by the size of the frames and the jobs.
+"""Frames per second of `kgcp detect` on one machine, by size of frames and number of jobs.
 
 Linux only: it reads the CPU time of the processes in /proc.
 """
@@ -22,13 +22,13 @@ from kgcp.simulation.presets import preset
 
 _PRESET = "consumer"  # colour JPEG
 _RENDERED = 12
-_SCALES = {1.0: 160, 2.5: 60}  # of the preset's camera: frames to examine
-_WARM = 0.2  # of the frames, before the clock starts
+_SCALES = {1.0: 160, 2.5: 60}  # scale of the preset's camera → number of frames
+_WARM = 0.2  # share of the frames before the clock starts
 _JOBS = (1, 2)
 
 
 def make_flight(folder: Path, scale: float, frames: int) -> str:
-    """Write a flight of a camera with more pixels, and name its size."""
+    """Write a flight of a camera with more pixels; return its frame size in words."""
     settings = with_larger_camera(replace(preset(_PRESET), frames=_RENDERED), scale)
     larger = settings.camera
     plan = plan_flight(settings, 1)

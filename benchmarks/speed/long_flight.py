@@ -2,8 +2,8 @@
 
 Usage: python -m benchmarks.speed.long_flight [--frames 2000] [--preset consumer] [--repeats 2]
 
-Forty simulated frames are repeated under other names. Runs with one job and with two take turns,
-and the best of each counts: whatever else the machine does only adds.
+Forty simulated frames are repeated under other names. Runs with one job and with two take turns.
+The shortest run of each counts, since other work of the machine only adds time.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _JOBS = (1, 2)
 def make_flight(folder: Path, name: str, frames: int) -> None:
     """Simulate some frames of a preset, and repeat them."""
     plan = plan_flight(replace(preset(name), frames=_RENDERED), 1)
-    # in this process: a server of others would never end, which `run` waits for
+    # jobs 0: a server of worker processes would never end, and `run` would wait for it
     write_simulated_flight(plan, folder, jobs=0, on_frame=lambda: None)
     names = list_frames(folder / "frames")
     for number in range(_RENDERED, frames):
@@ -40,7 +40,7 @@ def make_flight(folder: Path, name: str, frames: int) -> None:
 @click.option("--preset", "name", default="consumer", show_default=True)
 @click.option("--repeats", type=click.IntRange(1), default=2, show_default=True)
 def main(frames: int, name: str, repeats: int) -> None:
-    """Print the best wall time per number of jobs, and how much faster two are."""
+    """Print the shortest wall time per number of jobs, and how much faster two jobs are."""
     with tempfile.TemporaryDirectory() as folder:
         flight = Path(folder) / name
         make_flight(flight, name, frames)

@@ -1,9 +1,9 @@
-"""What a frame costs whose target must be there and is not: both looks, over decoding.
+"""CPU time of frames in which a predicted target is missing, relative to decoding.
 
-Usage: python -m benchmarks.speed.missing_targets [--flights DIR] [--frames 10]
+Usage: python -m benchmarks.speed.missing_targets [--flights DIR] [--frames 20]
 
-In every second frame the plate is painted over, with a disc or with what lies beside it. The others
-say where it must be.
+In every second frame the plate is painted over, with a disc or with a copy of the ground beside it.
+The other frames predict where it must be.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ if TYPE_CHECKING:
     from kgcp.geometry.arrays import GreyArray
     from kgcp.measurement.records import Measurement
 
-_REPEATS = 3  # the least of them counts: whatever else the machine does only adds
-_REACH = 1.6  # radii of the main ring that are painted over
-_HEADER = "set                     painted      frames   Mpx  decode ms  first look  both looks"
+_REPEATS = 3  # the smallest counts, since other work of the machine only adds time
+_REACH = 1.6  # radius that is painted over, in radii of the main ring
+_HEADER = "set                     painted      frames   Mpx  decode ms  first pass both passes"
 
 
 @dataclass(frozen=True, slots=True)
 class MissCost:
-    """CPU times of one frame [s]: of decoding, and of both looks, decoding included."""
+    """CPU times of one frame [s]: decoding, first pass with decoding, and second pass."""
 
     decode_s: float
-    first_s: float
-    second_s: float
+    first_pass_s: float
+    second_pass_s: float
 
 
 def _timed(function: Callable[[], object], before: Callable[[], object] = lambda: None) -> float:
-    """Time a function, with something done before that does not count."""
+    """Return the CPU time of a function; `before` is called before each run and not timed."""
     best_s = float("inf")
     for _ in range(_REPEATS):
         before()
@@ -53,7 +53,7 @@ def _timed(function: Callable[[], object], before: Callable[[], object] = lambda
 
 
 def _painted(image: GreyArray, measured: Measurement, paint: str) -> GreyArray:
-    """Hide a plate: below a grey disc, or below the ground beside it."""
+    """Hide a plate below a grey disc, or below a copy of the ground beside it."""
     import numpy as np
 
     (x, y), reach = measured.centre_px, _REACH * measured.appearance.radius_px
@@ -67,7 +67,7 @@ def _painted(image: GreyArray, measured: Measurement, paint: str) -> GreyArray:
 
 
 def costs_of(source: Source, work: Path, paint: str) -> Iterator[MissCost]:
-    """Paint over the targets of every second frame, and time what becomes of these frames."""
+    """Paint over the targets of every second frame, and time both passes on these frames."""
     import cv2
     import numpy as np
 
@@ -93,7 +93,7 @@ def costs_of(source: Source, work: Path, paint: str) -> Iterator[MissCost]:
     kept.folder.mkdir()
 
     def forget_frames() -> None:
-        """Take back what was kept: to replace a file costs more than to make one."""
+        """Remove kept frames, because replacing a file takes longer than creating one."""
         remove_kept_frames(kept.folder)
         kept.folder.mkdir()
 
@@ -124,24 +124,26 @@ def costs_of(source: Source, work: Path, paint: str) -> Iterator[MissCost]:
             guided = GuidedInput(inputs[row], firsts[row], visible)
             path = folder / source.frames[row]
             decode_s = _timed(partial(read_grey, path, flight.camera))
-            first_s = _timed(partial(examine_frame, job, inputs[row]), before=forget_frames)
-            second_s = _timed(partial(examine_frame_again, job, guided))
-            yield MissCost(decode_s, first_s, second_s)
+            first_pass_s = _timed(partial(examine_frame, job, inputs[row]), before=forget_frames)
+            second_pass_s = _timed(partial(examine_frame_again, job, guided))
+            yield MissCost(decode_s, first_pass_s, second_pass_s)
 
 
 @click.command()
 @click.option("--flights", type=click.Path(path_type=Path), default=None, help="Folder of flights.")
-@click.option("--frames", type=click.IntRange(4), default=20, show_default=True, help="Per line.")
+@click.option(
+    "--frames", type=click.IntRange(4), default=20, show_default=True, help="Frames per line."
+)
 def main(flights: Path | None, frames: int) -> None:
-    """Print means over the frames of every set, as multiples of decoding."""
+    """Print mean CPU times of the frames of every set, divided by that of decoding."""
     use_one_thread_each()  # before any library of numbers is loaded
-    from benchmarks.speed.costs import cv2_alone
+    from benchmarks.speed.costs import use_one_opencv_thread
     from benchmarks.speed.sources import flights_of
 
-    cv2_alone()
+    use_one_opencv_thread()
     with tempfile.TemporaryDirectory(prefix="kgcp_missing_") as folder:
         work = Path(folder)
-        print("CPU time on one thread over that of decoding; means", flush=True)
+        print("CPU time on one thread, divided by that of decoding; means", flush=True)
         print(_HEADER, flush=True)
         for source in flights_of(flights, work, frames):
             for paint in ("disc", "ground"):
@@ -149,12 +151,13 @@ def main(flights: Path | None, frames: int) -> None:
                 if not costs:
                     continue
                 decode_s = statistics.mean(cost.decode_s for cost in costs)
-                first_s = statistics.mean(cost.first_s for cost in costs)
-                both_s = first_s + statistics.mean(cost.second_s for cost in costs)
+                first_pass_s = statistics.mean(cost.first_pass_s for cost in costs)
+                both_passes_s = first_pass_s + statistics.mean(cost.second_pass_s for cost in costs)
                 megapixels = 1e-6 * source.flight.camera.width * source.flight.camera.height
                 print(
                     f"{source.name:24s}{paint:10s}{len(costs):9d}{megapixels:6.1f}"
-                    f"{1e3 * decode_s:11.1f}{first_s / decode_s:12.2f}{both_s / decode_s:12.2f}",
+                    f"{1e3 * decode_s:11.1f}{first_pass_s / decode_s:12.2f}"
+                    f"{both_passes_s / decode_s:12.2f}",
                     flush=True,
                 )
 

@@ -1,14 +1,14 @@
-"""kgcp beside other detectors of coded targets, on the same frames in the same run.
+"""CPU time of kgcp and of other detectors of coded targets, on the same frames in the same run.
 
 Usage: python -m benchmarks.speed.peers [--flights DIR] [--photos DIR] [--frames 10]
 (DIR as for benchmarks.speed.relative_costs)
 
-Each has one thread, and its time includes decoding the frame, which comes right before it: in a
-tight loop, decoding is up to twice as fast as in a run. Of AprilTag 3 (pupil-apriltags, `pip
-install pupil-apriltags`) tag36h11 with decimation 2; of OpenCV's ArUco 6x6_250, both by default.
-They look for their own markers, of which there are none: this is what their search costs. kgcp also
-measures its targets, where the frames have some; an unknown tone curve over the base that a run
-settles, where the frames tell it.
+Each detector has one thread, and its time includes decoding the frame, which takes place right
+before: in a tight loop, decoding is up to twice as fast as in a run. AprilTag 3 (pupil-apriltags,
+`pip install pupil-apriltags`) searches for tag36h11 with decimation 2, and OpenCV's ArUco for
+6x6_250, both with default settings. The frames show none of their markers, so that only their
+search is timed. kgcp also measures its targets if the frames show any. If the tone curve is
+unknown, it starts from the base curve that a run would have chosen, if the frames determine it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from benchmarks.speed.sources import Source
     from kgcp.geometry.arrays import GreyArray
 
-_REPEATS = 3  # the least of them counts: whatever else the machine does only adds
+_REPEATS = 3  # the smallest counts, since other work of the machine only adds time
 _HEADER = "set                       frames   Mpx  decode ms     kgcp  AprilTag   ArUco"
 
 
@@ -40,7 +40,7 @@ def _april_tags() -> Callable[[GreyArray], object] | None:
         detector = importlib.import_module("pupil_apriltags").Detector
     except ModuleNotFoundError:
         return None
-    # one for all sets, since it frees what it does not own when a second one ends
+    # one detector for all sets: when a second one ends, it frees memory that it does not own
     made = detector(families="tag36h11", nthreads=1, quad_decimate=2.0)
     return made.detect  # type: ignore[no-any-return]  # it has no types
 
@@ -54,7 +54,7 @@ def _aruco() -> Callable[[GreyArray], object]:
 
 
 def ratios_of(source: Source) -> Iterator[tuple[float, list[float]]]:
-    """Yield the time of decoding each frame [s], and that of each detector over it, decoded."""
+    """Yield, per frame, the time of decoding [s] and each detector's time, divided by it."""
     from kgcp.io.images.frames import read_grey
     from kgcp.measurement.frame import examine
     from kgcp.measurement.search.pyramid import eight_bit
@@ -86,16 +86,26 @@ def ratios_of(source: Source) -> Iterator[tuple[float, list[float]]]:
 
 @click.command()
 @click.option("--flights", type=click.Path(path_type=Path), default=None, help="Folder of flights.")
-@click.option("--photos", type=click.Path(path_type=Path), default=None, help="Without targets.")
-@click.option("--frames", type=click.IntRange(2), default=10, show_default=True, help="Per line.")
+@click.option(
+    "--photos",
+    type=click.Path(path_type=Path),
+    default=None,
+    help="Folder of photographs without targets.",
+)
+@click.option(
+    "--frames", type=click.IntRange(2), default=10, show_default=True, help="Frames per line."
+)
 def main(flights: Path | None, photos: Path | None, frames: int) -> None:
-    """Print medians over the frames of every set, as multiples of decoding."""
+    """Print median CPU times of the frames of every set, divided by that of decoding."""
     use_one_thread_each()  # before any library of numbers is loaded
     from benchmarks.speed.sources import flights_of, photographs_of
 
     with tempfile.TemporaryDirectory(prefix="kgcp_peers_") as folder:
         sources = flights_of(flights, Path(folder), frames)
-        print("CPU time with decoding, on one thread, over that of decoding; medians", flush=True)
+        print(
+            "CPU time with decoding, on one thread, divided by that of decoding; medians",
+            flush=True,
+        )
         print(_HEADER, flush=True)
         for source in (*sources, *photographs_of(photos, sources[0])):
             chosen = source.spread(frames)

@@ -1,4 +1,4 @@
-"""What is measured in processes of their own: two jobs against one, memory, size, `--help`."""
+"""Measurements in separate processes: two jobs against one, memory, size, `--help`."""
 
 from __future__ import annotations
 
@@ -14,44 +14,44 @@ from pathlib import Path
 
 import cv2
 
-from benchmarks.speed.costs import Costs, FrameCost, cost_and_memory, cv2_alone
+from benchmarks.speed.costs import Costs, FrameCost, cost_and_memory, use_one_opencv_thread
 from benchmarks.speed.sources import Source, flight_over
 from kgcp.io.flight.flight import Flight
 from kgcp.pipeline.detect import RunOptions, detect_flight
 from kgcp.settings import DetectSettings
 
 _JOBS_FRAMES = 120
-_WARM = 0.2  # of the frames, before the clock starts
+_WARM = 0.2  # share of the frames before the clock starts
 _MEGAPIXELS = (2, 4, 8, 12, 16, 24, 36, 50)
-_BASE_MB, _FRAMES_HELD = 250, 4  # limit of a worker's memory
+_BASE_MB, _FRAMES_HELD = 250, 4  # limit of a worker's memory: base [MB], and bytes per pixel
 _QUALITY = 92
 _HELP_RUNS = 5
 _MB = 1e6
 
 
 class _Clock:
-    """Takes the time between a warm start and the last frame."""
+    """Measures the time from the end of the warm-up to the last frame."""
 
     def __init__(self) -> None:
         self.times_s: list[float] = []
 
     def note(self, text: str) -> None:
-        """Hear of nothing that matters here."""
+        """Ignore a message."""
 
     def progress(self, stage: str, done: int, total: int, found: int) -> None:
-        """Note when a frame was done."""
+        """Record the time at which a frame was done."""
         del stage, done, total, found
         self.times_s.append(time.perf_counter())
 
     @property
     def frames_per_s(self) -> float:
-        """Rate after the first frames."""
+        """Frames per second after the warm-up."""
         first = int(_WARM * len(self.times_s))
         return (len(self.times_s) - 1 - first) / (self.times_s[-1] - self.times_s[first])
 
 
 def jobs_line(source: Source, work: Path) -> str:
-    """Examine the same frames with one job and with two, and compare the rates."""
+    """Examine the same frames with one job and with two; return both rates in words."""
     folder = work / "repeated"
     folder.mkdir()
     for number in range(_JOBS_FRAMES):
@@ -83,7 +83,7 @@ def help_line() -> str:
 
 
 def size_lines(picture: tuple[Path, Source], work: Path) -> Iterator[str]:
-    """Rescale a picture, and give cost and memory of each size in a process of its own."""
+    """Rescale a picture; yield CPU time and memory for each size, from separate processes."""
     path, source = picture
     yield f"{path.name}, rescaled"
     yield "   Mpx  decode ms   search   whole   ns/pixel  worker MB   limit MB"
@@ -104,7 +104,7 @@ def size_lines(picture: tuple[Path, Source], work: Path) -> Iterator[str]:
 
 def _in_own_process(path: Path, flight: Flight) -> str:
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=spawn, initializer=cv2_alone) as pool:
+    with ProcessPoolExecutor(1, mp_context=spawn, initializer=use_one_opencv_thread) as pool:
         return _size_line(
             *pool.submit(cost_and_memory, path, flight.camera, flight.targets).result()
         )

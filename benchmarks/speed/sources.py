@@ -1,4 +1,4 @@
-"""The frames that the benchmark of speed is run on: flights, photographs, or simulated ones."""
+"""Frames for the benchmarks of speed: flights, photographs, or simulated flights."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from kgcp.simulation.presets import SimulationSettings, preset
 
 _PRESETS = ("clean", "consumer")
 _AS_IT_IS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-_DECIDING = 32  # frames that tell the base of a tone curve
-_FOCAL = 1.2  # of a photograph's width
-_LARGE = 2.5  # times as many pixels each way: 12 Mpx
+_DECIDING = 32  # frames that determine the base of a tone curve
+_FOCAL = 1.2  # focal length, relative to a photograph's width
+_LARGE = 2.5  # factor of the pixels in width and height, which makes 12 Mpx
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +35,11 @@ class Source:
     Attributes
     ----------
     flight : Flight
-        Its frames folder, camera and targets.
+        Flight with the frames folder, camera and targets.
     frames : tuple of str
-        Paths relative to that folder.
+        Paths relative to the frames folder.
     tone_base : ToneBase or None
-        What a run settles for the tone curve, if that is unknown and the frames tell it.
+        Base that a run chooses for the tone curve, if this is unknown and the frames determine it.
     """
 
     name: str
@@ -49,12 +49,12 @@ class Source:
 
     @property
     def priors(self) -> Mapping[str, PlatePrior]:
-        """What a run knows of the targets once the base is settled, by their names."""
+        """What a run knows of the targets once the base is chosen, by name of the target."""
         prior = PlatePrior(tone_base=self.tone_base)
         return {target.name: prior for target in self.flight.targets}
 
     def spread(self, count: int) -> Source:
-        """Return the source with some of its frames, or all of them if there are fewer."""
+        """Return the source with `count` of its frames, evenly spread, or all if fewer."""
         chosen = np.unique(np.linspace(0, len(self.frames) - 1, count).round().astype(int))
         return replace(self, frames=tuple(self.frames[i] for i in chosen))
 
@@ -74,7 +74,7 @@ def flights_of(folder: Path | None, work: Path, count: int) -> list[Source]:
 
 
 def large_flight(work: Path) -> Source:
-    """Simulate a flight of 12 Mpx in `work`, with as many frames as tell its tone curve."""
+    """Simulate a flight of 12 Mpx in `work`, with enough frames to determine its tone curve."""
     name = f"{_PRESETS[-1]}, larger"
     settings = with_larger_camera(replace(preset(_PRESETS[-1]), frames=_DECIDING), _LARGE)
     plan = plan_flight(settings, 1)
@@ -83,7 +83,7 @@ def large_flight(work: Path) -> Source:
 
 
 def with_larger_camera(settings: SimulationSettings, scale: float) -> SimulationSettings:
-    """Return the settings with so many times the pixels each way, in the same field of view."""
+    """Return the settings with `scale` times the pixels in width and height, and the same view."""
     camera = settings.camera
     larger = replace(
         camera,
@@ -101,7 +101,7 @@ def _source(name: str, folder: Path) -> Source:
 
 
 def _tone_base_of(source: Source) -> ToneBase | None:
-    """Return what a run settles for an unknown tone curve; None: it is known, or not settled."""
+    """Return the base that a run chooses for an unknown tone curve; None: known, or not chosen."""
     flight = source.flight
     if flight.camera.response is not Response.UNKNOWN:
         return None
@@ -114,7 +114,7 @@ def _tone_base_of(source: Source) -> ToneBase | None:
 
 
 def photographs_of(folder: Path | None, like: Source) -> list[Source]:
-    """Return the photographs in a folder by their size, with the targets of a flight."""
+    """Return the photographs of a folder, one source per size, with the targets of a flight."""
     if folder is None or not folder.is_dir():
         return []
     by_size: dict[tuple[int, int], list[str]] = {}
@@ -133,13 +133,13 @@ def photographs_of(folder: Path | None, like: Source) -> list[Source]:
 
 
 def flight_over(like: Source, folder: Path, width: int, height: int) -> Flight:
-    """Return the flight with other frames: those in a folder, of a camera of that size."""
+    """Return the flight with the frames of another folder, and a camera of their size."""
     focal_px = _FOCAL * width
     camera = Camera(width, height, focal_px, focal_px, 0.5 * width, 0.5 * height)
     return replace(like.flight, frames_folder=folder, camera=camera, times_file=None)
 
 
 def photograph_of(photographs: Sequence[Source], otherwise: Source) -> tuple[Path, Source]:
-    """Return a richly textured picture, and its source: the first photograph, or a frame."""
+    """Return a richly textured picture, the first photograph or else a frame, and its source."""
     source = photographs[0] if photographs else otherwise
     return source.flight.frames_folder / source.frames[0], source

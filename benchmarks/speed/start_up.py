@@ -1,11 +1,11 @@
-"""Wall time of `kgcp detect` on a short flight, where it goes, and what a first run compiles.
+"""Wall and CPU time of `kgcp detect` on a short flight, by stages, and of a first run.
 
 Usage: python -m benchmarks.speed.start_up [--repeats 5] [--cold] [--keep DIR]
 
-Two flights of 20 frames of 4 Mpx are simulated: `clean` (linear PNG) and `consumer` (JPEG of
-unknown tone). The best run of several counts: whatever else the machine does only adds. CPU time is
-that of all processes. Python writes and reads compiled modules in these runs, as it does where kgcp
-is installed, also if the environment of the benchmark forbids it. Linux only.
+Two flights of 20 frames of 4 Mpx are simulated: `clean` (linear PNG) and `consumer` (JPEG with an
+unknown tone curve). The shortest of several runs counts, since other work of the machine only adds
+time. CPU time is that of all processes. In these runs, Python writes and reads compiled modules as
+it does where kgcp is installed, even if the environment of the benchmark forbids it. Linux only.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ import click
 
 _FRAMES, _MEGAPIXELS = 20, 4.0
 _PRESETS = ("clean", "consumer")
-_SUBREAPER = 36  # of prctl: processes without a parent become children of this one
+_SUBREAPER = 36  # option of prctl: orphaned processes become children of this process
 _STAGE = re.compile(r"^ *([0-9.]+) s  (.+)$", re.MULTILINE)
-_PARTS = {  # of the list above
+_PARTS = {  # what is timed → program
     "Python alone": "pass",
     "what a worker imports": "import kgcp.pipeline.frame_task",
     "the same, with its compiled code": (
@@ -40,7 +40,7 @@ _PARTS = {  # of the list above
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """Times of a program [s], those of its processes together, and what it wrote to stderr."""
+    """Wall time and CPU time of a program with all its processes [s], and its stderr."""
 
     wall_s: float
     cpu_s: float
@@ -48,10 +48,10 @@ class Run:
 
 
 def run(program: list[str], environment: Mapping[str, str] | None = None) -> Run:
-    """Run a program to its end, and to that of its processes."""
+    """Run a program until it and all its processes have ended."""
     begin_s, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
     names = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
-    # a file: the end of a pipe is that of the last process, some 0.1 s after that of the program
+    # to a file: a pipe stays open until the last process ends, some 0.1 s after the program
     with tempfile.TemporaryFile("w+") as messages:
         subprocess.run(program, env={**names, **(environment or {})}, stderr=messages, check=True)
         wall_s = time.perf_counter() - begin_s
@@ -68,14 +68,14 @@ def run(program: list[str], environment: Mapping[str, str] | None = None) -> Run
 
 
 def detecting(flight: Path, *options: str) -> list[str]:
-    """Return the command for all frames of a flight, from the beginning."""
+    """Return the command that detects in all frames of a flight, without resuming."""
     out = str(flight.parent / f"results_{flight.name}")
     program = [sys.executable, "-m", "kgcp", "detect", str(flight), "--out", out]
     return [*program, "--restart", "--quiet", *options]
 
 
 def make_flight(folder: Path, name: str) -> None:
-    """Simulate a flight of a preset whose camera has more pixels."""
+    """Simulate a flight of a preset, with more pixels."""
     from kgcp.pipeline.simulate import write_simulated_flight
     from kgcp.simulation.flight import plan_flight
     from kgcp.simulation.presets import preset
@@ -90,12 +90,12 @@ def make_flight(folder: Path, name: str) -> None:
         **{key: scale * getattr(camera, key) for key in ("fx", "fy", "cx", "cy")},
     )
     plan = plan_flight(replace(settings, camera=larger, frames=_FRAMES), 1)
-    # in this process: a server of others would never end, which `run` waits for
+    # jobs 0: a server of worker processes would never end, and `run` would wait for it
     write_simulated_flight(plan, folder, jobs=0, on_frame=lambda: None)
 
 
 def print_runs(flight: Path, repeats: int) -> None:
-    """Print the best run on a flight, and the stages of the best one that tells them."""
+    """Print the shortest run on a flight, and the stages of the shortest run with --profile."""
     run(detecting(flight))  # compiles
     best = min((run(detecting(flight)) for _ in range(repeats)), key=lambda each: each.wall_s)
     alone = min(
@@ -123,7 +123,7 @@ def print_runs(flight: Path, repeats: int) -> None:
 
 
 def print_parts(repeats: int) -> None:
-    """Print the CPU time of starting the processes of a run."""
+    """Print wall and CPU time of starting the processes of a run."""
     for name, program in _PARTS.items():
         parts = [run([sys.executable, "-c", program]) for _ in range(repeats)]
         wall_s, cpu_s = (min(getattr(part, key) for part in parts) for key in ("wall_s", "cpu_s"))
@@ -131,7 +131,7 @@ def print_parts(repeats: int) -> None:
 
 
 def print_cold_start(flight: Path, folder: Path) -> None:
-    """Print what the first run costs, with one job and with two: both compile once."""
+    """Print wall and CPU time of a first run, which compiles, with one job and with two."""
     for jobs in ("1", "2"):
         cache = {"NUMBA_CACHE_DIR": str(folder / f"cache_{jobs}")}
         first = run(detecting(flight, "--jobs", jobs), cache)
@@ -144,8 +144,12 @@ def print_cold_start(flight: Path, folder: Path) -> None:
 
 @click.command()
 @click.option("--repeats", type=click.IntRange(1), default=5, show_default=True)
-@click.option("--cold", "is_cold", is_flag=True, help="Also the first run: minutes.")
-@click.option("--keep", type=click.Path(path_type=Path), help="Where the flights are kept.")
+@click.option(
+    "--cold", "is_cold", is_flag=True, help="Also time a first run, which compiles: takes minutes."
+)
+@click.option(
+    "--keep", type=click.Path(path_type=Path), help="Folder in which to keep the flights."
+)
 def main(repeats: int, *, is_cold: bool, keep: Path | None) -> None:
     """Print the tables."""
     ctypes.CDLL(None).prctl(_SUBREAPER, 1, 0, 0, 0)

@@ -17,7 +17,7 @@ from benchmarks.aat.gcps import (
     render_window,
     window_of,
 )
-from benchmarks.aat.settings import BlockSettings, Way, random_stream
+from benchmarks.aat.settings import BlockSettings, Control, random_stream
 from benchmarks.aat.table import Trial, summarise, table_lines
 from kgcp.geometry.camera import Camera
 from kgcp.measurement.records import Measurement
@@ -106,10 +106,10 @@ def test_the_engine_projects_as_kgcp_does() -> None:
 
 def without_noise(block: Block) -> tuple[Block, KgcpSet]:
     """Return a block whose observations are the truth, but for the believed calibration."""
-    sights, ride = block.sights, block.ride
-    _, pixels = project_all(block.camera, block.views, sights.points_enu_m)
-    exact = replace(sights, pixels=pixels[sights.frame, sights.point])
-    gcps = sights.points_enu_m[sights.checks : sights.checks + sights.gcps]
+    image_points, ride = block.image_points, block.ride
+    _, pixels = project_all(block.camera, block.views, image_points.points_enu_m)
+    exact = replace(image_points, pixels=pixels[image_points.frame, image_points.point])
+    gcps = image_points.points_enu_m[image_points.checks : image_points.checks + image_points.gcps]
     centres = np.array([view.position_enu_m for view in block.views])
     step = adjust.free_parameters(block.camera) - adjust.free_parameters(block.believed)
     poses = [
@@ -132,14 +132,14 @@ def without_noise(block: Block) -> tuple[Block, KgcpSet]:
         by_calibration=slopes,
         sd_common=2e-4,
     )
-    return replace(block, sights=exact, gnss_enu_m=centres, gcps_enu_m=gcps), kgcps
+    return replace(block, image_points=exact, gnss_enu_m=centres, gcps_enu_m=gcps), kgcps
 
 
-@pytest.mark.parametrize("way", list(Way))
-def test_a_block_without_noise_returns_the_truth(block: Block, way: Way) -> None:
+@pytest.mark.parametrize("control", list(Control))
+def test_a_block_without_noise_returns_the_truth(block: Block, control: Control) -> None:
     exact, kgcps = without_noise(block)
-    found = adjust.adjust(exact, kgcps, way, None)
-    truth = exact.sights.points_enu_m[: exact.sights.checks]
+    found = adjust.adjust(exact, kgcps, control, None)
+    truth = exact.image_points.points_enu_m[: exact.image_points.checks]
     np.testing.assert_allclose(found.checks_enu_m, truth, atol=1e-5)
     true_calibration = adjust.free_parameters(block.camera)
     np.testing.assert_allclose(found.calibration, true_calibration, atol=2e-3)
@@ -149,8 +149,8 @@ def test_a_block_without_noise_returns_the_truth(block: Block, way: Way) -> None
 def test_more_control_predicts_better_heights(block: Block) -> None:
     exact, kgcps = without_noise(block)
     sds = [
-        np.sqrt(np.diagonal(adjust.adjust(exact, kgcps, way, None).cov_m2)[2::3].mean())
-        for way in (Way.GNSS, Way.KGCPS, Way.DISTANCES)
+        np.sqrt(np.diagonal(adjust.adjust(exact, kgcps, control, None).cov_m2)[2::3].mean())
+        for control in (Control.GNSS, Control.KGCPS, Control.DISTANCES)
     ]
     assert sds[0] > 2.0 * sds[1] > 2.0 * sds[2]
 
@@ -225,7 +225,7 @@ def test_true_predictions_are_called_true() -> None:
     np.testing.assert_allclose(row.predicted_m, sd)
     assert row.whole_scatter == pytest.approx(1.0, abs=0.04)
     assert row.benefit == pytest.approx(6.0)
-    lines = list(table_lines({("free", Way.KGCPS): row}))
+    lines = list(table_lines({("free", Control.KGCPS): row}))
     assert len(lines) == 3
     assert "| free | + KGCPs | " in lines[2]
 
@@ -233,12 +233,12 @@ def test_true_predictions_are_called_true() -> None:
 def test_the_figure_is_light_and_always_the_same() -> None:
     rng = np.random.default_rng(7)
     trials = {
-        (calibration, way): [
+        (calibration, control): [
             Trial(np.tile(0.1 * rng.standard_normal(3), (24, 1)), 0.01 * np.eye(72), 0.5, 0.5)
             for _ in range(20)
         ]
         for calibration in ("free", "known")
-        for way in Way
+        for control in Control
     }
     figure = draw_benefit(trials, BlockSettings().checks_along_m)
     assert figure.startswith(b"\x89PNG")
