@@ -26,37 +26,37 @@ test: export PYTHONDONTWRITEBYTECODE :=
 test: $(VENV)/.develops ## run the tests
 	$(BIN)/python -m pytest -n auto --dist worksteal
 
-check: lint types test ## all that must pass before a change goes in
+check: lint types test ## everything that must pass before a change is merged
 
 lint: $(VENV)/.develops ## check style and format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-types: $(VENV)/.develops ## check the type annotations, also as Windows and macOS read them
+types: $(VENV)/.develops ## check the type annotations, also for Windows and macOS
 	$(BIN)/mypy
 	$(BIN)/mypy --platform win32 kgcp
 	$(BIN)/mypy --platform darwin kgcp
 
-format: $(VENV)/.develops ## bring the code into the project's format
+format: $(VENV)/.develops ## format the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench-accuracy: $(VENV)/.runs ## measure simulated flights: errors, scatter, Cramér-Rao bound (minutes)
+bench-accuracy: $(VENV)/.runs ## errors on simulated flights, against reported accuracy and bound (minutes)
 	$(BIN)/python -m benchmarks.accuracy.presets $(BENCH)
 
 PHOTOS := ../shared/real
 
-bench-search: $(VENV)/.runs ## search hard frames and photographs: found, missed, wrong (half an hour)
+bench-search: $(VENV)/.runs ## targets found, missed and mistaken in hard frames and photographs (half an hour)
 	$(BIN)/python -m benchmarks.search.hard_frames $(BENCH)
 	$(BIN)/python -m benchmarks.search.false_alarms $(PHOTOS)
 
-first-flights: $(VENV)/.runs ## record docs/first_flight_runs.md anew: a minute
+first-flights: $(VENV)/.runs ## record docs/first_flight_runs.md anew (a minute)
 	$(BIN)/python -m benchmarks.first_flight.runs --write
 
-bench-speed: $(VENV)/.runs ## search and detection as multiples of decoding, jobs, memory, sizes (minutes)
+bench-speed: $(VENV)/.runs ## time of search and detection relative to decoding, and memory (minutes)
 	$(BIN)/python -m benchmarks.speed.relative_costs --flights ../shared/flights --photos $(PHOTOS) $(BENCH)
 
-bench-aat: $(VENV)/.runs ## what KGCPs are worth in a simulated adjustment: table, figure (ten minutes)
+bench-aat: $(VENV)/.runs ## how much KGCPs improve a simulated adjustment: table, figure (ten minutes)
 	$(PIP) --editable '.[aat]'
 	$(BIN)/python -m benchmarks.aat.benefit --figure docs/aat_benefit.png $(BENCH)
 
@@ -68,7 +68,7 @@ soak: $(VENV)/.runs ## memory and speed of detect over 20 000 small frames (a qu
 
 FUZZ_SECONDS ?= 300
 
-fuzz: $(VENV)/.runs ## look for files that break a reader, FUZZ_SECONDS for each kind (half an hour)
+fuzz: $(VENV)/.runs ## search for files that break a reader, FUZZ_SECONDS for each kind (half an hour)
 	$(PIP) --editable '.[fuzz]'
 	$(BIN)/python -m fuzz --seconds $(FUZZ_SECONDS) $(FUZZ)
 
