@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _MATRIX_KEYS = ("cameramatrix", "intrinsicmatrix", "k", "m1", "mtx")
 _DISTORTION_KEYS = (
     *("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff"),
-    *("distortion", "dist", "d", "d1"),
+    *("distcoefs", "distortion", "dist", "d", "d1"),
 )
 _WIDTH_KEYS = ("imagewidth", "width")
 _HEIGHT_KEYS = ("imageheight", "height")
@@ -51,8 +51,13 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
         raise unsupported(file, "a fisheye model")
     if matrix is None:
         raise file.error("has no camera_matrix", "add it or use another calibration")
+    if coefficients is None:  # not a lens without distortion: the name may be another one
+        raise file.error(
+            "has no distortion_coefficients",
+            "give them this name; for a lens without distortion, write zeros",
+        )
     size = (int(width), int(height)) if width and height else None
-    return (opencv_entry("", size, matrix, coefficients or []),)
+    return (opencv_entry("", size, matrix, coefficients),)
 
 
 def opencv_entry(

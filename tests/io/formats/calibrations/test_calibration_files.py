@@ -49,6 +49,8 @@ SAMPLES: dict[str, object] = {
     "opencv": (
         "%YAML:1.0\n---\nimage_width: 1600\nimage_height: 1100\ncamera_matrix: !!opencv-matrix\n"
         "   rows: 3\n   cols: 3\n   dt: d\n   data: [1700, 0, 800, 0, 1700, 550, 0, 0, 1]\n"
+        "distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 4\n   dt: d\n"
+        "   data: [0, 0, 0, 0]\n"
     ),
     "ros": (
         "image_width: 1600\nimage_height: 1100\ncamera_matrix:\n  rows: 3\n  cols: 3\n"

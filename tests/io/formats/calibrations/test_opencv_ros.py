@@ -72,7 +72,12 @@ def test_opencv_s_files_mean_what_opencv_projects(
 
 @pytest.mark.parametrize(
     "keys",
-    [("Camera_Matrix", "Distortion_Coefficients"), ("cameraMatrix", "distCoeffs"), ("K", "D")],
+    [
+        ("Camera_Matrix", "Distortion_Coefficients"),
+        ("cameraMatrix", "distCoeffs"),
+        ("K", "D"),
+        ("camera_matrix", "dist_coefs"),
+    ],
 )
 def test_the_names_of_opencv_s_samples_are_known(tmp_path: Path, keys: tuple[str, str]) -> None:
     path = opencv_file(
@@ -104,6 +109,12 @@ def test_the_size_may_stand_beside_a_silent_file_and_must_agree(tmp_path: Path) 
     assert read_calibration(sized, (1600, None)).height == 1200
     with pytest.raises(KgcpError, match=r"1600 x 1200 px, but \[camera\] says 1600 x 900"):
         read_calibration(sized, (None, 900))
+
+
+def test_distortion_of_an_unknown_name_is_not_taken_for_none(tmp_path: Path) -> None:
+    path = opencv_file(tmp_path / "camera.yml", PLUMB_BOB, keys=("camera_matrix", "kc"))
+    with pytest.raises(KgcpError, match="has no distortion_coefficients; give them this name"):
+        read_calibration(path, SILENT)
 
 
 @pytest.mark.parametrize(
