@@ -34,6 +34,12 @@ def require_range(
     raise SettingError(key, f"{value:g}{suffix} is out of range", f"give a value {bounds}{suffix}")
 
 
+def require_flag(key: str, value: object) -> None:
+    """Raise `SettingError` unless a value is true or false: the word `no` would count as true."""
+    if value not in (True, False):
+        raise SettingError(key, f"{value!r} is neither True nor False", "give one of them")
+
+
 def require_word(key: str, value: str, words: type[WordT]) -> WordT:
     """Return the word that a value is, or raise `SettingError` if it is none of them."""
     try:
@@ -93,6 +99,8 @@ class DetectSettings:
         require_range("min_radius_px", self.min_radius_px, 1.0, 1e4, unit="px")
         require_range("min_score", self.min_score, 0.0, 1.0, open_low=True)
         require_range("false_alarm", self.false_alarm, 0.0, 1.0, open_low=True)
+        require_flag("is_guided", self.is_guided)
+        require_flag("is_learning", self.is_learning)
         require_range("canny_low", self.canny_low, 1.0, 255.0)
         require_range("canny_high", self.canny_high, self.canny_low, 255.0)
         require_range("max_circle_deviation", self.max_circle_deviation, 0.0, 0.5, open_low=True)

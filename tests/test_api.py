@@ -26,6 +26,10 @@ CAMERA = kgcp.Camera(640, 480, 800.0, 800.0, 320.0, 240.0)
 # `Any`, to pass wrong types as well, and words where the types ask for an enumeration.
 untyped_settings: Any = kgcp.DetectSettings
 untyped_replace: Any = replace
+untyped_measure: Any = kgcp.measure_frame
+untyped_options: Any = kgcp.RunOptions
+untyped_selection: Any = kgcp.Selection
+FRAME = np.zeros((480, 640), np.uint8)
 
 
 def test_every_public_name_is_there_and_described() -> None:
@@ -140,6 +144,19 @@ def test_the_method_is_taken_as_a_word() -> None:
             lambda: kgcp.measure_frame(np.zeros((480, 640), np.uint8), CAMERA, [RING]),  # type: ignore[list-item]
             r"targets: has a Ring; give kgcp.Target\(ring\)",
         ),
+        (lambda: untyped_measure(FRAME, CAMERA, kgcp.Target(RING)), "a single Target; give a list"),
+        (lambda: untyped_measure(FRAME, None, [kgcp.Target(RING)]), "camera: is a NoneType; give"),
+        (
+            lambda: untyped_measure(FRAME, CAMERA, [kgcp.Target(RING)], {"method": "paper"}),
+            "settings: is a dict; give a kgcp.DetectSettings",
+        ),
+        (lambda: untyped_replace(RING, code_deg=43), "code_deg: 43 is no list"),
+        (lambda: untyped_replace(CAMERA, k1="0.1"), "k1: is not a finite number"),
+        (lambda: untyped_settings(is_guided="no"), "is_guided: 'no' is neither True nor False"),
+        (lambda: untyped_settings(is_learning=None), "is_learning: None is neither True nor"),
+        (lambda: untyped_options(is_restart="no"), "is_restart: 'no' is neither True nor False"),
+        (lambda: untyped_options(jobs=1.5), "jobs: 1.5 is not a whole number"),
+        (lambda: untyped_selection(keep_flagged="no"), "keep_flagged: 'no' is neither True nor"),
     ],
 )
 def test_wrong_arguments_are_named(make: Callable[[], object], problem: str) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from numbers import Real
 from typing import Self
 
 import numpy as np
@@ -173,7 +174,8 @@ class Camera:
                     "give the principal point in pixels from the centre of the top-left pixel",
                 )
         for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"):
-            if not math.isfinite(getattr(self, key)):
+            value = getattr(self, key)
+            if not isinstance(value, Real) or not math.isfinite(value):
                 raise SettingError(key, "is not a finite number", "give a number or leave it out")
         require_range("readout_s", self.readout_s, 0.0, 10.0, unit="s")
         for key, words in (("response", Response), ("time_reference", TimeReference)):

@@ -16,7 +16,7 @@ from kgcp.georef.gcp import Flag, Gcp, SkippedSighting, SkipReason
 from kgcp.georef.jumps import find_jumps
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.sighting import Sighting
-from kgcp.settings import require_range
+from kgcp.settings import require_flag, require_range
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +56,7 @@ class Selection:
             require_range("min_ambiguity", self.min_ambiguity, 0.0, math.inf)
         require_range("min_spacing_m", self.min_spacing_m, 0.0, math.inf, unit="m")
         require_range("checkpoint_share", self.checkpoint_share, 0.0, 1.0)
+        require_flag("keep_flagged", self.keep_flagged)
 
 
 def exclude(

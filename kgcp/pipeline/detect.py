@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from kgcp.errors import KgcpError
+from kgcp.errors import KgcpError, SettingError
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.marks import HandMark, read_marks
@@ -46,7 +46,7 @@ from kgcp.pipeline.overlay import draw_overlay
 from kgcp.pipeline.run_summary import DetectionSummary, Stopwatch, SummaryBuilder
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.report.contact_sheet import ContactSheet
-from kgcp.settings import DetectSettings, require_range
+from kgcp.settings import DetectSettings, require_flag, require_range
 from kgcp.targets.plain import shape_of
 
 
@@ -96,9 +96,14 @@ class RunOptions:
     def __post_init__(self) -> None:
         if self.jobs is not None:
             require_range("jobs", self.jobs, 0, 256)
+            if self.jobs != int(self.jobs):
+                raise SettingError("jobs", f"{self.jobs:g} is not a whole number", "give one")
+            object.__setattr__(self, "jobs", int(self.jobs))
         require_range(
             "frame_timeout_s", self.frame_timeout_s, 0.0, math.inf, unit="s", open_low=True
         )
+        for key in ("is_restart", "is_profiled", "all_candidates"):
+            require_flag(key, getattr(self, key))
 
 
 class NoProgress:

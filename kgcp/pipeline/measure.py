@@ -46,7 +46,12 @@ def measure_frame(
         If the array is not one grey frame of the camera's size, or the targets cannot be told
         apart.
     """
+    for key, value, kind in (("camera", camera, Camera), ("settings", settings, DetectSettings)):
+        if not isinstance(value, kind):
+            raise KgcpError(f"{key}: is a {type(value).__name__}; give a kgcp.{kind.__name__}")
     _check_frame(grey, camera)
+    if isinstance(targets, Target):
+        raise KgcpError("targets: is a single Target; give a list of them")
     wanted = tuple(targets)
     if not wanted:
         raise KgcpError("targets: is empty; name at least one target to look for")
