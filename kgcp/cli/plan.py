@@ -193,12 +193,13 @@ def _aligned(columns: Sequence[tuple[str, str]], rows: Iterable[Sequence[str]]) 
 
 def _ground_cells(outlook: Outlook) -> list[str]:
     digits = 0 if min(outlook.footprint_m) >= _ROUND_M else 1
+    offset_px = outlook.eccentricity_px
     return [
         f"{outlook.height_m:g}",
         f"{1e3 * outlook.gsd_m:.1f}",
         " × ".join(f"{side_m:.{digits}f}" for side_m in outlook.footprint_m),
         f"{outlook.frames_per_pass:.1f}",
-        f"{outlook.eccentricity_px:.3f}",
+        "–" if offset_px is None else f"{offset_px:.3f}",
     ]
 
 

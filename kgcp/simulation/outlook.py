@@ -150,8 +150,9 @@ class Outlook:
     footprint_m: tuple[float, float]  # width and height of the image on the ground
     # number of frames with the whole main ring while the camera passes along the image's height
     frames_per_pass: float
-    # offset of the centre of the ring's ellipse, in the middle of the image and at `OBLIQUE_DEG`
-    eccentricity_px: float
+    # offset of the centre of the ring's ellipse, in the middle of the image and at `OBLIQUE_DEG`;
+    # None: the ring reaches behind the camera
+    eccentricity_px: float | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -364,14 +365,15 @@ def _plain_accuracy(
     return by_distance * scale, by_centre * math.hypot(centre_px, by_normal_px)
 
 
-def _eccentricity_px(camera: Camera, radius_px: float) -> float:
+def _eccentricity_px(camera: Camera, radius_px: float) -> float | None:
     angle_rad = math.radians(OBLIQUE_DEG)
     circle = Circles3D.with_normals(
         np.array([[0.0, 0.0, 1.0]]),
         np.array([[math.sin(angle_rad), 0.0, math.cos(angle_rad)]]),
         np.array([radius_px / camera.mean_focal_px]),
     )
-    return float(np.linalg.norm(eccentricity(camera, circle).total_px[0]))
+    offset_px = float(np.linalg.norm(eccentricity(camera, circle).total_px[0]))
+    return offset_px if math.isfinite(offset_px) else None
 
 
 def _seen_ring(camera: Camera, target: Target, metre_px: float) -> Ring | None:

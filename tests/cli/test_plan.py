@@ -93,6 +93,15 @@ def test_the_ground_has_a_table_of_its_own(flight: Path) -> None:
     assert plan["frames_per_pass"] == pytest.approx((900 * 40 / 1902 - 0.9) / 10.0)
 
 
+def test_a_ring_that_reaches_behind_the_camera_has_no_eccentricity(flight: Path) -> None:
+    plan = json.loads(
+        run(flight, "--height", "0.1", "--json").stdout,
+        parse_constant=lambda word: pytest.fail(f"{word} is not JSON"),
+    )
+    assert plan["heights"][0]["eccentricity_px"] is None
+    assert "nan" not in run(flight, "--height", "0.1").stdout
+
+
 @pytest.mark.parametrize("heights", [("50", "100"), ("10",)])
 def test_the_figure_has_plain_numbers(flight: Path, heights: tuple[str, ...]) -> None:
     path = flight / "plan.svg"
