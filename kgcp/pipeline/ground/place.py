@@ -206,15 +206,21 @@ def place_flight(
 
 def _require_fit(placement: Placement, flight: Flight, poses: Path | None) -> None:
     """Refuse a placement without targets, or with poses that do not belong to the images."""
+    source, option = poses or flight.folder / "flight.toml", None if poses is None else "poses"
     if not placement.targets:
         name, reason = next(iter(placement.skipped.items()))
-        raise KgcpError(f"no target can be placed: {name!r} {reason}")
+        raise KgcpError(
+            f"{source}: no target can be placed ({name!r}: {reason}); look whether enough frames"
+            " show the targets and have a pose, and whether axes and angles of the poses are of the"
+            " stated kind",
+            option=option,
+        )
     if placement.noise.centre_px >= MAX_EXTRA_PX:
         raise KgcpError(
-            f"{poses or flight.folder / 'flight.toml'}: the poses do not fit the images, by"
+            f"{source}: the poses do not fit the images, by"
             f" {MAX_EXTRA_PX:.0f} px or more; look whether angles are of the stated kind, and"
             " whether each pose has its own frame's name",
-            option=None if poses is None else "poses",
+            option=option,
         )
 
 
