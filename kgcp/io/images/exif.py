@@ -71,7 +71,6 @@ class _Tags:
     main: Mapping[int, Any] = field(default_factory=dict)
     gps: Mapping[int, Any] = field(default_factory=dict)
     xmp: bytes = b""
-    size_px: tuple[int, int] | None = None
 
 
 def load_formats() -> None:
@@ -96,7 +95,6 @@ def _exif_tags(path: Path) -> _Tags:
                 {**exif, **exif.get_ifd(IFD.Exif)},
                 exif.get_ifd(IFD.GPSInfo),
                 xmp if isinstance(xmp, bytes) else b"",
-                image.size,
             )
     finally:
         Image.MAX_IMAGE_PIXELS = limit
@@ -118,7 +116,7 @@ def read_frame_header(path: Path, frame: str) -> FrameHeader:
         has_position = longitude_deg is not None and latitude_deg is not None
         if longitude_deg == latitude_deg == 0.0:  # written by cameras without a fix
             has_position = False
-        size_px = tags.size_px or _size_px(path)
+        size_px = _size_px(path)
         return FrameHeader(
             frame,
             size_px,
@@ -147,7 +145,7 @@ def _focal_px(tags: Mapping[int, Any], size_px: tuple[int, int] | None) -> float
 
 
 def _size_px(path: Path) -> tuple[int, int] | None:
-    """Return width and height, even of files that Pillow refuses."""
+    """Return width and height as they are stored; Pillow turns those of a TIFF by its tag."""
     try:
         with path.open("rb") as stream:
             return image_size(stream)

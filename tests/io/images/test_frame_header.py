@@ -107,3 +107,10 @@ def test_the_focal_length_in_pixels_of_a_resized_frame(
     Image.fromarray(np.zeros((48, 64), dtype=np.uint8)).save(tmp_path / "a.jpg", exif=exif)
     found = read_frame_header(tmp_path / "a.jpg", "a.jpg").focal_px
     assert found == (None if focal_px is None else pytest.approx(focal_px, abs=0.01))
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_the_size_of_a_tiff_is_that_of_its_stored_pixels(tmp_path: Path, orientation: int) -> None:
+    path = tmp_path / "a.tif"
+    Image.fromarray(np.zeros((48, 64), np.uint8)).save(path, tiffinfo={274: orientation})
+    assert read_frame_header(path, "a").size_px == (64, 48)

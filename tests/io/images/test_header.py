@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from kgcp.io.images.exif import Exif, read_exif
-from kgcp.io.images.header import image_size, is_greedy, with_stored_pixels
+from kgcp.io.images.header import image_size, is_greedy, misread_pixels, with_stored_pixels
 
 SIZE = (43, 29)
 
@@ -56,6 +56,7 @@ def test_no_header_is_trusted(head: bytes, place: int, noise: bytes) -> None:
     size = image_size(BytesIO(data))
     assert size is None or len(size) == 2
     assert len(with_stored_pixels(BytesIO(data))) == len(data)
+    assert isinstance(misread_pixels(BytesIO(data)), str)
 
 
 def tags_of_the_same_bytes(count: int, size: int, start: int) -> bytes:
