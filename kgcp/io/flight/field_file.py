@@ -14,7 +14,7 @@ from kgcp.io.flight.point_field_file import POINT_KEYS, point_field, point_lines
 from kgcp.io.flight.toml_draft import toml_text
 from kgcp.io.flight.toml_file import read_toml
 from kgcp.io.flight.toml_table import TomlTable
-from kgcp.io.formats.fields import FORMATS
+from kgcp.io.formats.fields import FORMATS, WITHOUT_UNIT
 from kgcp.targets.fields.layout import Field, FieldBar, FieldPolarity, GridKind, Mark
 from kgcp.targets.fields.points import AnyField, PointField
 
@@ -50,10 +50,11 @@ def read_field(text: str, unit: str | None = None) -> AnyField:
     Raises
     ------
     KgcpError
-        Naming the text, or file and key, and the remedy.
+        Naming the text, or file and key, and the remedy; also if a unit is given for what has one.
     """
     shorthand = _SHORTHAND.fullmatch(text)
     if shorthand is not None:
+        _refuse_unit(text, unit)
         return _from_shorthand(text, shorthand)
     path = Path(text)
     if not is_file(path):
@@ -62,12 +63,24 @@ def read_field(text: str, unit: str | None = None) -> AnyField:
             option="field",
         )
     if path.suffix == ".toml":
+        _refuse_unit(text, unit)
         return _from_toml(path)
     file = ForeignFile(path, "the field")
+    form = FORMATS.recognised(file)
+    if form not in WITHOUT_UNIT:
+        _refuse_unit(text, unit)
     try:
-        return FORMATS.reader(file)(file, None if unit is None else _METRES[unit])
+        return FORMATS.reader(file, form)(file, None if unit is None else _METRES[unit])
     except SettingError as error:
         raise KgcpError(f"{path}: {error}") from None
+
+
+def _refuse_unit(text: str, unit: str | None) -> None:
+    if unit is not None:
+        raise KgcpError(
+            f"{text}: has lengths of a known unit, which {unit!r} would not change; leave it out",
+            option="unit",
+        )
 
 
 def refuse_to_overwrite_field(text: str, written: Iterable[Path]) -> None:

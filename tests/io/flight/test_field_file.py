@@ -267,8 +267,19 @@ def test_wrong_field_toml(tmp_path: Path, old: str, new: str, message: str) -> N
     ],
 )
 def test_damaged_boards_are_one_line(tmp_path: Path, text: str, old: str, new: str) -> None:
+    unit = "mm" if text == BOOFCV else None
     with pytest.raises(KgcpError, match="board"):
-        read_field(write(tmp_path, "board", text.replace(old, new, 1)), "mm")
+        read_field(write(tmp_path, "board", text.replace(old, new, 1)), unit)
+
+
+@pytest.mark.parametrize("text", [DICE, ROS, TOML, "grid:10x8:25mm:15mm"])
+def test_a_unit_is_refused_where_it_would_be_ignored(tmp_path: Path, text: str) -> None:
+    name = "field.toml" if text == TOML else "board"
+    field = text if text.startswith("grid:") else write(tmp_path, name, text)
+    read_field(field)
+    with pytest.raises(KgcpError, match="leave it out") as caught:
+        read_field(field, "in")
+    assert caught.value.option == "unit"
 
 
 POINTS_TOML = """\

@@ -2,7 +2,7 @@
 
 Each module has one line in `FORMATS` and offers two functions. `matches(file)` says whether the
 content has its format, `field(file, unit_m)` returns its board. `unit_m` is needed if the format
-does not state the unit; other formats ignore it.
+does not state the unit (`WITHOUT_UNIT`), and None for the others.
 """
 
 from __future__ import annotations
@@ -25,3 +25,6 @@ FORMATS: Registry[Callable[[ForeignFile, float | None], AnyField]] = Registry(
         "nxyz": (nxyz.matches, nxyz.field),
     },
 )
+
+WITHOUT_UNIT = frozenset({"boofcv", "nxyz"})
+"""Names of the formats that do not state what unit their lengths are in."""
