@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera
+from kgcp.io.flight.camera_table import read_camera_file
 from kgcp.io.flight.folder import FolderContents
 from kgcp.io.flight.toml_draft import DraftKey
-from kgcp.io.formats.calibrations import read_calibration
+from kgcp.io.formats.calibrations import OF_FLIGHT, read_calibration
 from kgcp.pipeline.init_records import Gap, InitFinding, Section
 from kgcp.quality.checks.frame_header import FrameHeader
 
@@ -31,6 +34,7 @@ _REMEDY = (
     "put a calibration file into the folder before kgcp init, or write its values, or file = …,"
     " into [camera]"
 )
+_WORDS = replace(OF_FLIGHT, other_size="but the frames have")
 _SHUTTER = DraftKey("readout_s", None, "rolling shutter: time from first to last row", "0.03")
 _RESPONSE = DraftKey("response", None, 'or "srgb": how grey values follow light', '"linear"')
 
@@ -42,28 +46,31 @@ def camera_section(contents: FolderContents, headers: Sequence[FrameHeader]) -> 
         return _no_camera(None, "the headers of the frames do not state their size")
     size = max(sizes, key=lambda each: (sizes[each], each))
     first = next(header for header in headers if header.size_px == size)
-    for section in (
-        _by_file(contents, size),
-        _by_dewarp_data(contents, first, size),
-        _by_focal_length(headers, size),
-    ):
-        if section is not None:
-            return section
-    return _no_camera(size, "neither EXIF nor a file of the folder states the focal length")
+    section = _by_file(contents, size)
+    if section is not None:
+        return section
+    section = (
+        _by_dewarp_data(contents, first, size)
+        or _by_focal_length(headers, size)
+        or _no_camera(size, "neither EXIF nor a file of the folder states the focal length")
+    )
+    return replace(section, gaps=(*section.gaps, *_unfit_files(contents, size)))
 
 
 def _by_file(contents: FolderContents, size: tuple[int, int]) -> Section | None:
-    """Return the section by the first calibration file that is for frames of this size."""
-    for path in contents.calibrations:
+    """Return the section by the first calibration file that is for frames of this size.
+
+    A camera.toml of kgcp comes first: it has a covariance.
+    """
+    for path in sorted(contents.calibrations, key=lambda each: not _is_own(each)):
         try:
-            camera = read_calibration(path, size)
+            camera = _read(path, size)
         except KgcpError:  # of another size, or of several cameras
             continue
         name = contents.relative(path)
-        has_size = _has_size(contents, name)
         keys = (
             DraftKey("file", name, _shown(camera)),
-            *(() if has_size else _size_keys(size)),
+            *(() if _has_size(path) else _size_keys(size)),
             _RESPONSE,
             _SHUTTER,
         )
@@ -74,9 +81,38 @@ def _by_file(contents: FolderContents, size: tuple[int, int]) -> Section | None:
     return None
 
 
-def _has_size(contents: FolderContents, name: str) -> bool:
+def _unfit_files(contents: FolderContents, size: tuple[int, int]) -> Iterator[Gap]:
+    """Yield why each calibration file of the folder is not used."""
+    for path in contents.calibrations:
+        try:
+            _read(path, size)
+        except KgcpError as error:
+            problem, _, remedy = str(error).removeprefix(f"{path}: ").partition("; ")
+            yield Gap("camera", f"{contents.relative(path)} is not used: it {problem}", remedy)
+
+
+def _is_own(path: Path) -> bool:
+    return path.suffix == ".toml"
+
+
+def _read(path: Path, size: tuple[int, int]) -> Camera:
+    """Return the camera of a file, if it is one of frames of this size."""
+    if not _is_own(path):
+        return read_calibration(path, size, words=_WORDS)
+    camera, _ = read_camera_file(path)
+    if (camera.width, camera.height) != size:
+        raise KgcpError(
+            f"{path}: is for {camera.width} x {camera.height} px, {_WORDS.other_size} {size[0]} x"
+            f" {size[1]}; use the calibration of this frame size"
+        )
+    return camera
+
+
+def _has_size(path: Path) -> bool:
+    if _is_own(path):
+        return True
     try:
-        read_calibration(contents.folder / name, (None, None))
+        read_calibration(path, (None, None))
     except KgcpError:
         return False
     return True

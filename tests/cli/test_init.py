@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -21,6 +22,8 @@ from benchmarks.first_flight.bare_folders import (
 from kgcp.cli import main
 from kgcp.cli.init import quoted
 from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.calibration import CalibrationCovariance
+from kgcp.io.flight.camera_file import camera_toml
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight, read_flight
 from kgcp.io.images.frames import list_frames
@@ -167,6 +170,34 @@ def test_frames_named_by_time_with_calibration_and_sbet(bare: Path, tmp_path: Pa
     assert trajectory.attitude_deg == pytest.approx(PLAN.trajectory.attitude_deg, abs=1e-9)
     assert "from the frames' names, as frames.csv" in said
     assert "assumed: trajectory its times are GPS time" in said
+
+
+def test_a_camera_of_kgcp_calibrate_is_taken_with_its_covariance(
+    bare: Path, tmp_path: Path
+) -> None:
+    folder = copied(bare, "static", tmp_path)
+    camera = PLAN.settings.camera
+    covariance = CalibrationCovariance.of(("fx", "fy"), np.array([[4.0, 3.0], [3.0, 4.0]]))
+    (folder / "camera.toml").write_text(camera_toml(camera, covariance), encoding="utf-8")
+    matrix = f"{camera.fx} {camera.fy} {camera.cx + 0.5} {camera.cy + 0.5}"
+    (folder / "a.txt").write_text(f"1 PINHOLE {camera.width} {camera.height} {matrix}\n")
+    flight, _, said = made(folder, *TARGET)
+    assert flight.camera.k1 == camera.k1
+    assert flight.calibration_covariance is not None
+    assert flight.calibration_covariance.cov == pytest.approx(covariance.cov)
+    assert "from camera.toml (not used: a.txt)" in said
+
+
+def test_calibrations_of_another_size_are_named(bare: Path, tmp_path: Path) -> None:
+    folder = copied(bare, "static", tmp_path)
+    camera = replace(PLAN.settings.camera, width=700, height=500, cx=350.0, cy=250.0)
+    (folder / "camera.toml").write_text(camera_toml(camera, None), encoding="utf-8")
+    (folder / "a.txt").write_text("1 PINHOLE 700 500 900 900 350 250\n", encoding="utf-8")
+    flight, _, said = made(folder, *TARGET)
+    assert flight.is_camera_guessed
+    said = " ".join(said.split())
+    for name in ("a.txt", "camera.toml"):
+        assert f"{name} is not used: it is for 700 x 500 px, but the frames have" in said
 
 
 @pytest.mark.parametrize("height", ["Höhe", "U"])

@@ -11,6 +11,7 @@ from kgcp.errors import KgcpError
 from kgcp.io.files.csv_sniff import sniff_table
 from kgcp.io.files.safe_read import is_file, is_folder, is_number
 from kgcp.io.files.sniff import ForeignFile
+from kgcp.io.flight.camera_table import read_camera_file
 from kgcp.io.formats.calibrations import FORMATS as CALIBRATION_FORMATS
 from kgcp.io.formats.frame_times import looks_like_marks
 from kgcp.io.formats.orientations import FORMATS as POSE_FORMATS
@@ -138,6 +139,8 @@ def _kinds_of(path: Path) -> _Kinds:
     """Return what a file is: nothing of use, one thing, or calibration and poses at once."""
     if path.name == TARGETS_TOML:
         return (("targets", None),)
+    if path.suffix == ".toml":
+        return (("calibration", None),) if _is_own_camera(path) else ()
     if path.suffix.lower() not in _DATA_SUFFIXES:
         return ()
     file = ForeignFile(path, "")
@@ -146,6 +149,15 @@ def _kinds_of(path: Path) -> _Kinds:
         return next((kinds for recognise in recognisers if (kinds := recognise(file))), ())
     except (KgcpError, RecursionError):  # unreadable or damaged: its reader will report it
         return ()
+
+
+def _is_own_camera(path: Path) -> bool:
+    """Whether this is a camera.toml, as `kgcp calibrate` writes it."""
+    try:
+        read_camera_file(path)
+    except KgcpError:
+        return False
+    return True
 
 
 def _kinds_of_log(file: ForeignFile) -> _Kinds:
