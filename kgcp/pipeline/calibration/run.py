@@ -54,7 +54,7 @@ OTHER_SIZE = "other_size"
 UNLIKE_FIELD = "unlike_field"
 DUPLICATE = "duplicate"
 REASONS: Mapping[str, str] = {
-    Reason.DECODE_FAILED.value: "the file is not an image, or is damaged",
+    Reason.DECODE_FAILED.value: Reason.DECODE_FAILED.description,
     Reason.WORKER_DIED.value: Reason.WORKER_DIED.description,
     Reason.TIMED_OUT.value: Reason.TIMED_OUT.description,
     "too_few": "fewer than six discs like the field's",
