@@ -182,7 +182,7 @@ def _exif_time_parts(time_s: Mapping[str, float], *, is_moving: bool) -> Iterato
     yield DraftKey(
         "times", None, "without it, EXIF times are used", '"frames.csv"', is_missing=is_missing
     )
-    why = "neither a file nor EXIF has the frames' times with their zone"
+    why = "no file states the times of the frames, nor does EXIF together with a time zone"
     if time_s:
         yield InitFinding("times", f"{_span(time_s)}, from EXIF ({len(time_s)} frames)")
         why = "EXIF times are rarely good to a millisecond, in which a vehicle moves a centimetre"

@@ -186,7 +186,8 @@ def _guessed_px(header: FrameHeader) -> tuple[FrameHeader, float, str] | None:
     where = f"EXIF of {header.frame}"
     if header.focal_35_mm is not None:
         focal_px = header.focal_35_mm / _SMALL_FRAME_MM * _full_diagonal_px(*header.size_px)
-        return header, round(focal_px, 1), f"{where}: {header.focal_35_mm:g} mm as of 35 mm film"
+        source = f"{where}: equivalent to {header.focal_35_mm:g} mm on 35 mm film"
+        return header, round(focal_px, 1), source
     if header.focal_px is not None:
         source = f"{where}: {header.focal_mm:g} mm and the sensor's resolution"
         return header, round(header.focal_px, 1), source
