@@ -57,7 +57,7 @@ def moving_statistics(x: FloatArray, y: FloatArray, window: float) -> MovingStat
     """
     step = window / 10.0
     first, last = math.floor(x.min() / step), math.ceil(x.max() / step)
-    centre = step * np.arange(first, last + 1)
+    centre = step * np.arange(first, last + 1, dtype=np.float64)
     inside = np.abs(x - centre[:, None]) <= 0.5 * window
     count = inside.sum(axis=1)
     enough = count >= _MIN_IN_WINDOW

@@ -268,14 +268,15 @@ def _without_dots(seen: SeenPlate, hidden: BoolArray) -> BoolArray:
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(mask)
     off_ring = (rho_m > radii_m[0]) | (rho_m < radii_m[1])
     dot_px = 2.0 * radii_m[2] / seen.metres_per_px
-    hides = np.bincount(labels.ravel(), weights=off_ring) > 0
+    label_of_pixel = labels.ravel().astype(np.intp)
+    hides = np.bincount(label_of_pixel, weights=off_ring) > 0
     hides |= boxes[:, cv2.CC_STAT_AREA] > _DOT_AREAS * 0.25 * math.pi * dot_px**2
     hides |= (
         boxes[:, cv2.CC_STAT_WIDTH : cv2.CC_STAT_HEIGHT + 1].max(axis=1)
         > _DOT_LENGTHS * dot_px + 1.0
     )
     hides[0] = False
-    return np.asarray(hides[labels.ravel()])
+    return np.asarray(hides[label_of_pixel])
 
 
 @compiled

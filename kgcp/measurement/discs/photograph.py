@@ -256,7 +256,7 @@ def _has_small_hole(grey: GreyArray, outlines: list[DiscOutline]) -> BoolArray:
         places = centres[:, None] + radius * reach
         x, y = np.ascontiguousarray(places.astype(np.float32).transpose(2, 0, 1))
         read = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.median(np.asarray(read, dtype=np.float64), axis=1)
+        return np.asarray(np.median(np.asarray(read, dtype=np.float64), axis=1))
 
     ink = at(_INK)
     contrast = at(_GROUND) - ink

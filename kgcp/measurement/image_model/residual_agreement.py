@@ -33,4 +33,4 @@ def sums_over_arcs(
             weighted = own_derivatives[i, k] * weight[i]
             for j in range(all_count):
                 products[a, k, j] += weighted * all_derivatives[i, j]
-    return sums, products, (pixels > 0).sum()
+    return sums, products, int((pixels > 0).sum())

@@ -346,4 +346,5 @@ def _tells_heading(
     elsewhere = scores.max(axis=(0, 1)).take(lags, mode="wrap").max()
     dots = [round(deg * ANGLES / 360.0) + best.lag for deg in ring.code_deg]
     visible_dots = int(visible.take(dots, mode="wrap").sum())
-    return visible_dots >= _MIN_VISIBLE_DOTS * len(dots) and elsewhere <= best.score - _MARGIN
+    is_clear = bool(elsewhere <= best.score - _MARGIN)
+    return visible_dots >= _MIN_VISIBLE_DOTS * len(dots) and is_clear
