@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from threading import Lock
+from typing import Any
 
 import cv2
 import numpy as np
@@ -67,6 +68,8 @@ _GUESSED_IN_JPEG = ("Corrupt JPEG data", "Premature end of JPEG file")
 # "TIFF_Error". OpenCV for Windows is linked with a C library of its own, whose stderr does not
 # follow Python's: there, damage to a compressed TIFF goes unnoticed.
 _GUESSED_IN_TIFF = re.compile(r"Corrupt JPEG data.*|PackBitsDecode.*|(?<=TIFF_Error ).*")
+_LOGGING: Any = getattr(cv2.utils, "logging", cv2)  # OpenCV 4 has its functions elsewhere
+_WARNINGS = 3  # the level that OpenCV 5 calls LOG_LEVEL_WARNING
 _STDERR_LOCK = Lock()  # a process has only one stderr
 
 
@@ -292,12 +295,12 @@ def _collected_stderr() -> Iterator[list[str]]:
         sys.stderr.flush()
         stderr = os.dup(2)
         os.dup2(sink.fileno(), 2)
-        log_level = cv2.utils.logging.getLogLevel()  # may be set to silent by the environment
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_WARNING)
+        log_level = _LOGGING.getLogLevel()  # may be set to silent by the environment
+        _LOGGING.setLogLevel(_WARNINGS)
         try:
             yield messages
         finally:
-            cv2.utils.logging.setLogLevel(log_level)
+            _LOGGING.setLogLevel(log_level)
             os.dup2(stderr, 2)
             os.close(stderr)
             sink.seek(0)
