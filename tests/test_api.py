@@ -17,6 +17,7 @@ import kgcp
 from kgcp.geometry.camera import Response
 from kgcp.io.exporters.points import MapPoints
 from kgcp.settings import Method
+from tests.systems import share
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
@@ -57,7 +58,7 @@ def test_examples_that_start_processes_can_be_imported_by_them() -> None:
 
 
 def test_the_examples_of_the_page_run_one_after_the_other(tmp_path: Path) -> None:
-    (tmp_path / "sample_flight").symlink_to(ROOT / "sample_flight")
+    share(ROOT / "sample_flight", tmp_path / "sample_flight")
     # each example has its own names, as if it were run alone; one process saves the imports
     lines = [f"    exec({example!r}, {{'__name__': '__main__'}})\n" for example in EXAMPLES]
     script = tmp_path / "examples.py"

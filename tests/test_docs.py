@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import shutil
 import subprocess
 from collections.abc import Iterable
 from pathlib import Path
@@ -54,6 +55,8 @@ def test_named_benchmarks_exist() -> None:
 def test_no_file_has_marks_of_a_merge() -> None:
     if not (ROOT / ".git").exists():
         pytest.skip("not a clone")
+    if shutil.which("git") is None:
+        pytest.skip("no git to ask")
     command = ["git", "grep", "-nIE", "^(<<<<<<<|>>>>>>>) "]
     found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert (found.returncode, found.stdout, found.stderr) == (1, "", "")

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import re
 import shlex
 import sys
@@ -197,7 +198,7 @@ def _typed(folder: Path, command: str) -> str:
     result = CliRunner().invoke(kgcp, [name, *words, *jobs], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     output = result.stdout + (_counts(result.stderr) if jobs else result.stderr)
-    shown = _SPEED.sub("in … s", output.replace(f"{folder}/", ""))
+    shown = _SPEED.sub("in … s", output.replace(f"{folder}{os.sep}", ""))
     return f"    $ {command}\n" + "".join(f"    {line}\n" for line in shown.splitlines())
 
 

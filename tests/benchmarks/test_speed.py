@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
+pytest.importorskip("resource", reason="Windows counts no CPU time of threads")
+
 from benchmarks.speed.costs import Costs, FrameCost, cost_line, cost_of
 from benchmarks.speed.sources import Source, flight_over, photographs_of
 from kgcp.io.flight.flight import read_flight

@@ -8,8 +8,10 @@ from pathlib import Path
 from benchmarks.reliability.torture import detecting, make_flight, torture
 from kgcp.io.flight.flight import read_flight
 from kgcp.pipeline.detect import RunOptions, detect_flight
+from tests.systems import not_on_windows
 
 
+@not_on_windows("lists no workers in /proc")
 def test_a_run_that_is_killed_again_and_again_ends_with_the_same_table(tmp_path: Path) -> None:
     flight, out, tortured = (tmp_path / name for name in ("flight", "out", "tortured"))
     make_flight(flight, 20, 1, rendered=5)

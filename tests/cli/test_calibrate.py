@@ -402,7 +402,7 @@ def test_results_that_cannot_be_written_cost_no_measurements(
     obstacle.mkdir()
     arguments = (photos, "--field", photos / "field.toml", "--out", tmp_path, *QUIET)
     failed = run(*arguments)
-    assert f"{obstacle}: cannot be written" in failed.stderr
+    assert f"{obstacle}: is a folder" in failed.stderr
     assert failed.exit_code == 1
     obstacle.rmdir()
     for name in ("measure_photo", "measure_photo_again"):

@@ -11,6 +11,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from kgcp.cli import main
+from tests.systems import share
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_flight"
 
@@ -24,7 +25,7 @@ def flight(tmp_path: Path) -> Path:
     """The sample flight, with its own text files."""
     folder = tmp_path / "flight"
     shutil.copytree(SAMPLE, folder, ignore=shutil.ignore_patterns("frames", "kgcp"))
-    (folder / "frames").symlink_to(SAMPLE / "frames")
+    share(SAMPLE / "frames", folder / "frames")
     return folder
 
 

@@ -11,6 +11,7 @@ from click.testing import CliRunner
 
 from kgcp.cli import Program, main, shells
 from kgcp.cli.options import flight_places_argument
+from tests.systems import not_on_windows
 
 
 class OneCommand(Program):
@@ -40,7 +41,8 @@ def windows(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A folder with two flights and two frames, and a shell that expands nothing."""
     monkeypatch.setattr(shells, "SHELL_EXPANDS", False)
     monkeypatch.setattr("click.core.os", NtOs())
-    monkeypatch.setenv("HOME", "/home/someone")
+    for name in ("HOME", "USERPROFILE"):  # the second one is that of Windows
+        monkeypatch.setenv(name, "/home/someone")
     monkeypatch.chdir(tmp_path)
     for name in ("b 1", "a [1]"):
         (tmp_path / name).mkdir()
@@ -65,7 +67,7 @@ def shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *
         (("a [1*",), "a [1]"),
         (("none*",), "none*"),
         (('b 1"', "--frames", '2"'), "b 1 | 2"),
-        (("~/flights",), "/home/someone/flights"),
+        (("~/flights",), str(Path("/home/someone/flights"))),
         (("s3://bucket/flight*",), "s3://bucket/flight*"),
     ],
 )
@@ -85,6 +87,7 @@ def test_options_that_a_quotation_mark_has_swallowed_are_told() -> None:
     assert "leave out the backslash before the quotation mark" in result.stderr
 
 
+@not_on_windows("has none of the other shells")
 def test_other_shells_have_expanded_what_they_should(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
 import subprocess
@@ -16,6 +17,7 @@ from click.testing import CliRunner, Result
 
 from kgcp.cli import main
 from tests.flight_toml import RING_A
+from tests.systems import not_on_windows
 
 FRAMES, FEW = 100, 4
 TELLING_ALL = """\
@@ -65,6 +67,7 @@ def run(flight: Path, out: Path, *options: str) -> Result:
     return CliRunner().invoke(main, arguments, catch_exceptions=False)
 
 
+@not_on_windows("sends processes no signals")
 @pytest.mark.usefixtures("sigint_raises")
 @pytest.mark.parametrize(
     ("number", "code", "jobs"), [(signal.SIGINT, 130, "2"), (signal.SIGTERM, 143, "0")]
@@ -99,6 +102,7 @@ def test_a_signal_stops_the_run_and_the_same_command_goes_on(
     assert f"{FRAMES} frames in" in result.stderr
 
 
+@not_on_windows("sends processes no signals")
 @pytest.mark.usefixtures("sigint_raises")
 @pytest.mark.parametrize("jobs", ["0", "2"])
 def test_a_run_started_with_sigint_ignored_stops_at_sigterm_alone(
@@ -143,5 +147,6 @@ def test_the_run_is_recorded_beside_the_table(short_flight: Path, tmp_path: Path
     assert record["settings"]["min_radius_px"] == 8.0
     assert record["versions"].keys() >= {"kgcp", "python", "numpy", "opencv"}
     assert record["host"]["cores"] >= 1
-    assert 50.0 < record["peak_memory_mb"]["parent"] < 5000.0
+    if os.name != "nt":  # which does not say
+        assert 50.0 < record["peak_memory_mb"]["parent"] < 5000.0
     assert record["stages_s"]["first look"] > 0.0

@@ -5,6 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+
+pytest.importorskip("resource", reason="Windows limits no memory and has no pipes in folders")
+
 from click.testing import CliRunner
 
 from kgcp.cli import main

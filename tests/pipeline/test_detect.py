@@ -247,7 +247,7 @@ def test_an_unreadable_frame_is_a_row_among_the_others(flight: Path, tmp_path: P
     (folder / "frames" / "east").mkdir(parents=True)
     toml = (flight / "flight.toml").read_text(encoding="utf-8")
     toml = toml.replace("[frames]\n", "[frames]\nexif_fallback = true\n")
-    (folder / "flight.toml").write_text(toml, encoding="utf-8")
+    (folder / "flight.toml").write_text(toml, encoding="utf-8", newline="\n")
     for name in ("frame_0000.png", "frame_0003.png"):
         shutil.copy(flight / "frames" / name, folder / "frames")
     shutil.copy(flight / "frames" / "frame_0002.png", folder / "frames" / "east")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
@@ -37,6 +36,7 @@ from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.plate import image_plate
 from tests.flight_toml import RING_A, camera_table
+from tests.systems import kill
 
 CAMERA = Camera(320, 240, 900.0, 904.0, 156.3, 124.2)
 FRAMES, EMPTY = 9, (3, 6)
@@ -249,7 +249,7 @@ def test_a_table_that_cannot_be_written_keeps_the_journal(
     flight: Path, undisturbed: bytes, looks: Counter[str]
 ) -> None:
     (flight / "kgcp" / "detections.parquet" / "occupied").mkdir(parents=True)
-    with pytest.raises(KgcpError, match=r"detections\.parquet: cannot be written"):
+    with pytest.raises(KgcpError, match=r"detections\.parquet: is a folder"):
         detect(flight)
     shutil.rmtree(flight / "kgcp" / "detections.parquet")
     detect(flight)
@@ -289,7 +289,7 @@ def test_one_run_at_a_time(flight: Path, undisturbed: bytes) -> None:
 
 def examine_or_die(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
     if frame_input.frame == "f_8.png":
-        os.kill(os.getpid(), signal.SIGKILL)
+        kill(os.getpid())
     return examine_frame(job, frame_input)
 
 

@@ -39,6 +39,7 @@ from tests.plain_flight import (
     coded_ring,
     plain_target,
 )
+from tests.systems import share
 
 FOUR = (*TARGETS, plain_target("fourth", (0.3, -3.3), 0.8))
 FLIGHT = PlainFlight(targets=FOUR, moving=Target(coded_ring("car", (0, 43, 78, 180))))
@@ -166,7 +167,7 @@ def test_another_position_makes_it_another_target(folder: Path, tmp_path: Path) 
     swapped = text.replace(places[0], "@").replace(places[1], places[0]).replace("@", places[1])
     assert swapped != text
     for name in ("frames", "vehicle.csv", "reference.csv"):
-        (tmp_path / name).symlink_to(folder / name)
+        share(folder / name, tmp_path / name)
     (tmp_path / "flight.toml").write_text(swapped, encoding="utf-8")
     with pytest.raises(KgcpError, match=r"changed since 'kgcp detect': .* position_m"):
         make_gcps(read_flight(tmp_path), folder / "kgcp" / "detections.parquet")
@@ -174,10 +175,10 @@ def test_another_position_makes_it_another_target(folder: Path, tmp_path: Path) 
 
 def test_without_poses_nothing_is_looked_for(folder: Path, tmp_path: Path) -> None:
     text = (folder / "flight.toml").read_text(encoding="utf-8")
-    (tmp_path / "frames").symlink_to(folder / "frames")
+    share(folder / "frames", tmp_path / "frames")
     bare = text.replace('[reference]\nposes = "reference.csv"\n', "")
     (tmp_path / "flight.toml").write_text(bare, encoding="utf-8")
-    (tmp_path / "vehicle.csv").symlink_to(folder / "vehicle.csv")
+    share(folder / "vehicle.csv", tmp_path / "vehicle.csv")
     assert "12 no_prediction: give [reference] poses" in run("detect", tmp_path, "--jobs", "0")
     table = detections(tmp_path)
     assert set(table["target"][table["status"] == "measured"]) == {"car"}

@@ -44,7 +44,7 @@ def write(settings: SimulationSettings, out: Path, jobs: int = 1) -> FlightPlan:
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {
-        str(path.relative_to(folder)): path.read_bytes()
+        path.relative_to(folder).as_posix(): path.read_bytes()
         for path in sorted(folder.rglob("*"))
         if path.is_file()
     }

@@ -26,6 +26,7 @@ from kgcp.georef.local_frame import LocalFrame
 from kgcp.io.tables.columns import Row, time_cell
 from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.parquet import write_table
+from tests.systems import share
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_flight"
 CRS = "EPSG:25832"
@@ -140,7 +141,7 @@ class Flight:
         if self.pictures:
             self._write_pictures(folder / "frames")
         else:
-            (folder / "frames").symlink_to(SAMPLE / "frames")
+            share(SAMPLE / "frames", folder / "frames")
         lines = ["frame,time"]
         lines += [f"{name},{t:.6f}" for name, t in zip(self.frames, self.frame_s, strict=True)]
         (folder / "frames.csv").write_text("\n".join(lines), encoding="utf-8")

@@ -7,6 +7,7 @@ import pytest
 
 from kgcp.errors import KgcpError
 from kgcp.io.files.atomic import remove, whole_file, write_all, write_bytes
+from tests.systems import needs_links
 
 
 def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
@@ -34,6 +35,7 @@ def test_an_interrupt_leaves_the_old_file(tmp_path: Path) -> None:
     assert path.read_bytes() == b"old"
 
 
+@needs_links
 def test_a_link_in_the_way_is_not_followed(tmp_path: Path) -> None:
     elsewhere = tmp_path / "elsewhere"
     elsewhere.write_bytes(b"precious")

@@ -17,6 +17,7 @@ from kgcp.errors import KgcpError, Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.io.images.frames import list_frames, read_grey
+from tests.systems import not_on_windows
 
 WIDTH, HEIGHT = 320, 200
 CAMERA = Camera(width=WIDTH, height=HEIGHT, fx=400.0, fy=401.0, cx=160.0, cy=99.0)
@@ -87,6 +88,7 @@ class TestListFrames:
         with pytest.raises(KgcpError, match=r"nowhere: is not a folder; .*\[frames\] folder"):
             list_frames(tmp_path / "nowhere")
 
+    @not_on_windows("has no such names")
     def test_a_name_that_no_table_can_hold_is_an_error(self, tmp_path: Path) -> None:
         Path(os.fsdecode(bytes(tmp_path) + b"/\xff.jpg")).touch()
         with pytest.raises(KgcpError, match=r"not UTF-8; rename") as caught:

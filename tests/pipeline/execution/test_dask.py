@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
-import signal
 import sys
 from collections.abc import Iterator
 from concurrent.futures import Future
@@ -29,6 +27,7 @@ from kgcp.pipeline.detect import NoProgress, RunOptions, detect_flight
 from kgcp.pipeline.execution.dask_client import connected
 from kgcp.pipeline.execution.dask_worker import _processes
 from kgcp.pipeline.execution.resilient_map import Lost, TaskFailure, resilient_map
+from tests.systems import kill
 
 FRAMES = 8
 ANY_PORT = "127.0.0.1:0"
@@ -78,7 +77,7 @@ class Killer(NoProgress):
     def progress(self, stage: str, done: int, total: int, found: int) -> None:  # noqa: ARG002 - the base class's signature
         if self.killed is None and done >= self.done:
             self.killed = self.cluster.workers[0].pid
-            os.kill(self.killed, signal.SIGKILL)
+            kill(self.killed)
 
 
 def test_a_cluster_on_this_machine_gives_the_same_bytes(flight: Path, expected: bytes) -> None:

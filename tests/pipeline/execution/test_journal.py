@@ -33,6 +33,7 @@ from kgcp.measurement.records import (
     Uncertainty,
 )
 from kgcp.pipeline.execution.journal import Journal, fingerprint, from_text, to_text
+from tests.systems import needs_links, not_on_windows
 
 NO_RESULTS = (
     *("", "\0", "[]", "{}", "[" * 100_000),
@@ -277,6 +278,7 @@ def test_a_result_that_cannot_be_read_again_is_an_error(key: str, tmp_path: Path
     assert caught.value.on_command_line().endswith(" (--restart)")
 
 
+@not_on_windows("limits no sizes of files")
 def test_a_full_disk_is_a_line_and_the_journal_stays(tmp_path: Path) -> None:
     program = (
         "import resource, signal\n"
@@ -302,12 +304,19 @@ def test_what_is_in_the_way_is_a_line(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(KgcpError, match=r"cannot be written .*; choose another results folder"):
         open_journal(tmp_path / "file")
+
+
+@needs_links
+def test_a_link_in_the_way_is_a_line(tmp_path: Path) -> None:
     (tmp_path / "precious").write_bytes(b"mine")
     (tmp_path / "journal").symlink_to(tmp_path / "precious")
     with pytest.raises(KgcpError, match=r"journal: cannot be written \(is a link; delete it\)"):
         open_journal(tmp_path)
     assert (tmp_path / "precious").read_bytes() == b"mine"
-    (tmp_path / "journal").unlink()
+
+
+@not_on_windows("has no pipes in folders")
+def test_a_pipe_in_the_way_is_a_line(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "journal")
     with pytest.raises(KgcpError, match=r"journal: cannot be written \(is not a file; delete it\)"):
         open_journal(tmp_path)
