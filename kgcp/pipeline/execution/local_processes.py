@@ -179,9 +179,13 @@ class WorkerProcess:
                     if self._is_ended:
                         raise Lost(TaskFailure.CRASHED)
                     use_one_thread_each()
-                    self._process = _CONTEXT.Process(target=_serve, args=(child_end,), daemon=True)
-                    self._process.start()
+                    process = _CONTEXT.Process(target=_serve, args=(child_end,), daemon=True)
+                    self._process = process
+                    process.start()
                 child_end.close()
+                # Windows keeps the other end open until the process takes it, however it ends
+                if parent_end not in wait((parent_end, process.sentinel)):
+                    raise EOFError
                 parent_end.recv()  # the process has started, which does not count as work
                 if self._preparation is not None:
                     self._prepare(parent_end, self._preparation)

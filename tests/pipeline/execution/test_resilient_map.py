@@ -32,6 +32,7 @@ from kgcp.pipeline.execution.resilient_map import (
     resilient_map,
     usable_cores,
 )
+from tests.systems import kill, not_on_windows
 
 DEADLY, UNLUCKY, SLOW = 3, 5, 7
 LIMIT_S = 1.5
@@ -40,10 +41,10 @@ LIMIT_S = 1.5
 def work(folder: Path, item: int) -> int:
     """Square a number; of some, the process dies, always or once, or hangs."""
     if item == DEADLY:
-        os.kill(os.getpid(), signal.SIGKILL)
+        kill(os.getpid())
     if item == UNLUCKY and not (folder / "died").exists():
         (folder / "died").touch()
-        os.kill(os.getpid(), signal.SIGKILL)
+        kill(os.getpid())
     if item == SLOW:
         time.sleep(60.0)
     return item * item
@@ -251,6 +252,16 @@ def test_a_map_that_is_closed_early_does_not_wait(tmp_path: Path) -> None:
     wait_until_gone(workers_in(tmp_path))
 
 
+@pytest.mark.parametrize("pause_s", [0.0, 0.05, 0.2])
+def test_a_pool_that_is_closed_while_its_processes_start_does_not_wait(pause_s: float) -> None:
+    """On Windows, the parent has both ends of a pipe until the process takes one of them."""
+    start_s = time.monotonic()
+    with pool(2) as executor:
+        executor.submit(abs, 1)
+        time.sleep(pause_s)
+    assert time.monotonic() - start_s < 30.0
+
+
 class SlowExecutor(Executor):
     """Ends a call long after an interrupt should have been heard."""
 
@@ -262,6 +273,7 @@ class SlowExecutor(Executor):
         return future
 
 
+@not_on_windows("sends no signals to threads")
 @pytest.mark.usefixtures("sigint_raises")
 def test_an_interrupt_is_heard_soon_where_it_does_not_end_a_wait() -> None:
     """As on Windows before Python 3.13, and here if another thread gets the signal."""
