@@ -74,6 +74,15 @@ def require_file(path: Path, toml_key: str) -> None:
     raise KgcpError(f"{path}: {problem}; flight.toml names it under {toml_key}")
 
 
+def unreadable(path: Path, error: OSError, remedy: str) -> KgcpError:
+    """Return the error of a file that cannot be read, to be raised."""
+    if isinstance(error, PermissionError):
+        return KgcpError(
+            f"{path}: is protected, or open in another program; make it readable, or close it there"
+        )
+    return KgcpError(f"{path}: {error.strerror}; {remedy}")
+
+
 def read_bytes(path: Path, toml_key: str, most: int = MOST_BYTES) -> bytes:
     """Return the content of a file of at most `most` bytes.
 
@@ -89,7 +98,7 @@ def read_bytes(path: Path, toml_key: str, most: int = MOST_BYTES) -> bytes:
             room = min(size or _UNTOLD, most)  # which `read` takes at once, however little there is
             data = stream.read(room + 1) if size <= most else b""
     except OSError as error:
-        raise KgcpError(f"{path}: {error.strerror}; correct {toml_key}") from error
+        raise unreadable(path, error, f"correct {toml_key}") from error
     if size > most or len(data) > room:
         raise KgcpError(
             f"{path}: has at least {max(size, len(data))} bytes, more than the {most} allowed for"
@@ -115,7 +124,7 @@ def read_lines(path: Path, toml_key: str) -> Iterator[str]:
             likely = likely_encoding(start.read(_HEAD))
         raise KgcpError(f"{path}: is not text in UTF-8 but {likely}; save it as UTF-8") from error
     except OSError as error:
-        raise KgcpError(f"{path}: {error.strerror}; correct {toml_key}") from error
+        raise unreadable(path, error, f"correct {toml_key}") from error
 
 
 def likely_encoding(content: bytes) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.files.csv_text import is_separator_line
-from kgcp.io.files.safe_read import is_sound, read_bytes, require_file
+from kgcp.io.files.safe_read import is_sound, read_bytes, require_file, unreadable
 
 _ENTITY = re.compile(r"<!\s*ENTITY")
 _HEAD = 4096
@@ -47,7 +47,7 @@ class ForeignFile:
             with self.path.open("rb") as stream:
                 return stream.read(_HEAD)
         except OSError as error:
-            raise KgcpError(f"{self.path}: {error.strerror}; make it readable") from error
+            raise unreadable(self.path, error, "make it readable") from error
 
     @property
     def first_line(self) -> str:

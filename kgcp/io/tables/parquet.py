@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 
 from kgcp.errors import KgcpError
 from kgcp.io.files.atomic import whole_file
-from kgcp.io.files.safe_read import is_file
+from kgcp.io.files.safe_read import is_file, unreadable
 from kgcp.io.tables.columns import Column, ColumnType, Row
 
 if TYPE_CHECKING:  # 0.3 s that writing does not need
@@ -88,6 +88,8 @@ def read_table(path: Path, columns: Sequence[Column[Any]]) -> pd.DataFrame:
         raise KgcpError(f"{path}: does not exist; run the command that writes it first")
     try:
         table = pq.read_table(path)
+    except PermissionError as error:
+        raise unreadable(path, error, "make it readable") from error
     except (OSError, pa.ArrowException) as error:
         reason = (str(error).splitlines() or ["damaged"])[0]
         raise KgcpError(f"{path}: is not a readable Parquet table ({reason}); remake it") from error

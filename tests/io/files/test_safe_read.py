@@ -9,7 +9,10 @@ import pytest
 from kgcp.errors import KgcpError, one_line
 from kgcp.io.files.safe_read import is_file, is_folder, is_sound, read_bytes, read_lines
 from kgcp.io.files.safe_yaml import load_yaml
+from kgcp.io.files.sniff import ForeignFile
+from kgcp.io.tables.parquet import read_table
 from kgcp.pipeline.workspace import results_folder
+from tests.systems import needs_links, not_on_windows, share
 
 KEY = "[vehicle] trajectory"
 
@@ -20,15 +23,18 @@ def test_only_regular_files_are_read_and_names_of_any_length_may_be_asked_for(
     whole = tmp_path / "file"
     whole.write_bytes(b"12345")
     assert read_bytes(whole, KEY) == b"12345"
-    (tmp_path / "link").symlink_to("file")
+    share(whole, tmp_path / "link")
     assert read_bytes(tmp_path / "link", KEY, 5) == b"12345"
     with pytest.raises(
         KgcpError,
         match=r"file: has at least 5 bytes, more than the 4 allowed for .*trajectory.*; na",
     ):
         read_bytes(whole, KEY, 4)
-    os.mkfifo(tmp_path / "pipe")
-    for name in ("pipe", "."):
+    names = ["."]
+    if os.name != "nt":  # which has no pipes in folders
+        os.mkfifo(tmp_path / "pipe")
+        names.append("pipe")
+    for name in names:
         with pytest.raises(
             KgcpError, match=r"is not a regular file; flight.toml names it under \[veh"
         ):
@@ -40,6 +46,7 @@ def test_only_regular_files_are_read_and_names_of_any_length_may_be_asked_for(
             read_bytes(tmp_path / name, KEY)
 
 
+@not_on_windows("has no such files")
 def test_sizes_that_the_system_does_not_tell_are_limited_too(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to("/proc/self/status")  # of 0 bytes, it says
     with pytest.raises(KgcpError, match="more than the 3 allowed"):
@@ -60,6 +67,28 @@ def test_lines_are_read_as_they_are_wanted(tmp_path: Path) -> None:
         list(read_lines(path, KEY))
 
 
+def test_a_file_that_another_program_has_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As Windows refuses it; none of the keys that name the file is wrong."""
+    path = tmp_path / "data.parquet"
+    path.write_bytes(b"1,2")
+
+    def refused(*_: object, **__: object) -> object:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "open", refused)
+    monkeypatch.setattr("pyarrow.parquet.read_table", refused)
+    for read in (
+        lambda: read_bytes(path, KEY),
+        lambda: list(read_lines(path, KEY)),
+        lambda: ForeignFile(path, KEY).head,
+        lambda: read_table(path, ()),
+    ):
+        with pytest.raises(KgcpError, match=r"is protected, or open in another program; make it"):
+            read()
+
+
 def test_numbers_are_sound_up_to_what_could_overflow() -> None:
     assert all(map(is_sound, (0.0, -1.8e9, 6.4e6, 1781597701000.0)))
     assert not any(map(is_sound, (math.nan, math.inf, -math.inf, 1e15, 10**400)))
@@ -74,6 +103,7 @@ def test_a_message_is_one_line_that_no_terminal_obeys() -> None:
     assert cut.endswith("x; remedy")
 
 
+@needs_links
 @pytest.mark.parametrize("leads_to", ["../elsewhere", "nowhere"])
 def test_results_go_through_no_link(tmp_path: Path, leads_to: str) -> None:
     assert results_folder(tmp_path) == tmp_path / "kgcp"
