@@ -292,8 +292,13 @@ def _collected_stderr() -> Iterator[list[str]]:
     """
     messages: list[str] = []
     with _STDERR_LOCK, tempfile.TemporaryFile() as sink:
-        sys.stderr.flush()
-        stderr = os.dup(2)
+        if sys.stderr is not None:
+            sys.stderr.flush()
+        try:
+            stderr = os.dup(2)
+        except OSError:  # programs of windows alone have no stderr on Windows
+            yield messages
+            return
         os.dup2(sink.fileno(), 2)
         log_level = _LOGGING.getLogLevel()  # may be set to silent by the environment
         _LOGGING.setLogLevel(_WARNINGS)

@@ -320,3 +320,16 @@ def test_frames_read_in_threads_have_their_own_damage_and_stderr_is_kept(tmp_pat
         found = list(pool.map(is_read, [whole, damaged] * 200))
     assert found == [True, False] * 200
     assert os.fstat(2).st_ino == stderr
+
+
+def test_programs_without_stderr_read_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_descriptor(number: int) -> int:
+        raise OSError(9, f"Bad file descriptor: {number}")
+
+    path = tmp_path / "frame.png"
+    path.write_bytes(encoded(textured(), ".png"))
+    monkeypatch.setattr(sys, "stderr", None)
+    monkeypatch.setattr(os, "dup", no_descriptor)
+    np.testing.assert_array_equal(read_grey(path, CAMERA), textured())
