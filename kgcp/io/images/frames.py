@@ -62,12 +62,20 @@ _MAX_METADATA_BYTES = 1 << 26
 
 CORRECT_FOLDER = "correct [frames] folder in flight.toml"
 
-# Messages of decoders about data that they had to guess; they do not stop decoding.
-_GUESSED_IN_JPEG = ("Corrupt JPEG data", "Premature end of JPEG file")
-# On stderr. Those of libjpeg come through libtiff, whose own errors OpenCV prints after
-# "TIFF_Error". OpenCV for Windows is linked with a C library of its own, whose stderr does not
-# follow Python's: there, damage to a compressed TIFF goes unnoticed.
-_GUESSED_IN_TIFF = re.compile(r"Corrupt JPEG data.*|PackBitsDecode.*|(?<=TIFF_Error ).*")
+# Messages of libjpeg that do not concern pixels. All others are errors, or about data that it had
+# to guess.
+_UNUSUAL_IN_JPEG = (
+    "Invalid SOS parameters for sequential JPEG",
+    "Unknown Adobe color transform code",
+    "Warning: unknown JFIF revision number",
+)
+# Messages on stderr about data that decoders had to guess; they do not stop decoding. Those of
+# libjpeg may come through libtiff, whose own errors OpenCV prints after "TIFF_Error". OpenCV for
+# Windows is linked with a C library of its own, whose stderr does not follow Python's: there,
+# damage to a compressed TIFF goes unnoticed.
+_GUESSED_PIXELS = re.compile(
+    r"(Corrupt JPEG data|Premature end of JPEG file|PackBitsDecode|(?<=TIFF_Error )).*"
+)
 _LOGGING: Any = getattr(cv2.utils, "logging", cv2)  # OpenCV 4 has its functions elsewhere
 _WARNINGS = 3  # the level that OpenCV 5 calls LOG_LEVEL_WARNING
 _STDERR_LOCK = Lock()  # a process has only one stderr
@@ -259,27 +267,26 @@ def _decode(encoded: bytes) -> GreyArray:
     if grey is None:
         raise Rejection(Reason.DECODE_FAILED, f"{len(encoded)} bytes that are not a complete image")
     for message in messages:
-        if guess := _GUESSED_IN_TIFF.search(message):
+        if guess := _GUESSED_PIXELS.search(message):
             raise Rejection(Reason.DECODE_FAILED, guess[0])
     return grey
 
 
 def _decode_jpeg(encoded: bytes) -> GreyArray | None:
-    """Decode a JPEG to its luma; return None if this decoder cannot.
+    """Decode a JPEG to its luma; return None if it is unusual, but may be whole.
 
     Raises
     ------
     Rejection
-        `DECODE_FAILED` if a part of the pixels would be guessed.
+        `DECODE_FAILED` if the decoder would have to guess pixels, or cannot go on.
     """
-    encoded += JPEG_END  # an end that alone is missing changes no pixels
-    for is_strict in (True, False):  # nor does what else a strict decoder complains of
-        try:
-            return np.asarray(simplejpeg.decode_jpeg(encoded, "GRAY", strict=is_strict)[..., 0])
-        except ValueError as error:
-            if str(error).startswith(_GUESSED_IN_JPEG):
-                raise Rejection(Reason.DECODE_FAILED, str(error)) from error
-    return None
+    try:
+        # An end that alone is missing changes no pixels.
+        return np.asarray(simplejpeg.decode_jpeg(encoded + JPEG_END, "GRAY")[..., 0])
+    except ValueError as error:
+        if str(error).startswith(_UNUSUAL_IN_JPEG):
+            return None
+        raise Rejection(Reason.DECODE_FAILED, str(error)) from error
 
 
 @contextmanager
