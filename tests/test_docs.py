@@ -52,7 +52,7 @@ def test_named_benchmarks_exist() -> None:
         assert any(each.exists() for each in found), f"{path}: {module}"
 
 
-def test_no_file_has_marks_of_a_merge() -> None:
+def test_no_file_has_merge_conflict_markers() -> None:
     if not (ROOT / ".git").exists():
         pytest.skip("not a clone")
     if shutil.which("git") is None:
@@ -178,7 +178,7 @@ def test_the_contents_of_the_questions_are_its_headings() -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_have_existing_targets(page: Path) -> None:
     for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
         path, _, anchor = target.partition("#")
         if path.startswith("https://"):

@@ -139,7 +139,7 @@ def lightened(arguments: tuple[str, ...]) -> list[str]:
 @pytest.mark.parametrize(
     "shown", all_shown(), ids=lambda one: f"{one.where}: kgcp {' '.join(one.arguments)}"
 )
-def test_what_is_shown_runs(shown: Shown, workspace: Path) -> None:
+def test_documented_commands_run(shown: Shown, workspace: Path) -> None:
     name, *arguments = shown.arguments
     lighter = lightened(shown.arguments)
     is_read_only = any(word in READ_ONLY or word.startswith(STORES) for word in shown.arguments)
@@ -165,12 +165,12 @@ def programs() -> list[str]:
 
 @pytest.mark.usefixtures("workspace")
 @pytest.mark.parametrize("program", programs())
-def test_python_that_is_shown_runs(program: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_documented_python_runs(program: str, capsys: pytest.CaptureFixture[str]) -> None:
     exec(compile(program, "shown", "exec"), {})  # noqa: S102 - it is the project's own
     assert "frame_0002.jpg" in capsys.readouterr().out
 
 
-def test_the_flight_toml_of_the_guide_is_one(tmp_path: Path) -> None:
+def test_the_flight_toml_of_the_guide_is_valid(tmp_path: Path) -> None:
     guide = (ROOT / "docs" / "guide.md").read_text(encoding="utf-8")
     match = re.search(r"^```toml\n(.*?)^```$", guide, re.MULTILINE | re.DOTALL)
     assert match

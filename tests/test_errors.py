@@ -13,7 +13,7 @@ ERRORS = [
 
 
 @pytest.mark.parametrize("error", ERRORS, ids=str)
-def test_errors_pass_from_process_to_process(error: Exception) -> None:
+def test_errors_can_be_pickled_for_other_processes(error: Exception) -> None:
     error.add_note("raised by a worker")
     copy = pickle.loads(pickle.dumps(error))  # noqa: S301 - our own
     assert type(copy) is type(error)

@@ -211,7 +211,7 @@ def test_members_use_only_the_libraries_of_their_layer() -> None:
     assert strangers == []
 
 
-def test_nothing_below_io_knows_files() -> None:
+def test_no_layer_below_io_handles_files() -> None:
     knowing = [
         names(path)
         for path in modules()
@@ -259,7 +259,7 @@ def folders() -> list[Path]:
     return sorted({path.parent for path in modules()})
 
 
-def test_rooms_stay_small_enough_to_see_at_a_glance() -> None:
+def test_folders_have_few_modules() -> None:
     entries = {path.name for path in PACKAGE.iterdir() if path.suffix in {"", ".py"}}
     assert len(entries - {"__pycache__"}) <= 15
     for folder in folders():
@@ -278,7 +278,7 @@ def functions() -> Iterator[tuple[str, int]]:
                 yield f"{names(path)}:{node.lineno}", lines
 
 
-def test_functions_and_files_are_of_a_readable_size() -> None:
+def test_functions_and_files_are_short() -> None:
     """In the middle and mostly; a kernel with comments may be longer than that."""
     sizes = dict(functions())
     assert median(sizes.values()) <= 10

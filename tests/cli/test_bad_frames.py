@@ -54,7 +54,7 @@ def flight(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_bad_frames_are_rows_among_the_good_ones(flight: Path) -> None:
+def test_unreadable_frames_become_rows_beside_the_measured_ones(flight: Path) -> None:
     frames = flight / "frames"
     whole = (frames / "good_0.jpg").read_bytes()
     (frames / "cut.jpg").write_bytes(whole[: len(whole) // 2])
@@ -80,7 +80,7 @@ def test_bad_frames_are_rows_among_the_good_ones(flight: Path) -> None:
     assert "4 unreadable" in result.stderr
 
 
-def test_an_empty_frames_folder_is_a_line(flight: Path) -> None:
+def test_an_empty_frames_folder_is_a_one_line_error(flight: Path) -> None:
     for frame in (flight / "frames").iterdir():
         frame.unlink()
     line = one_line_of_error(run("detect", str(flight)))
@@ -89,7 +89,9 @@ def test_an_empty_frames_folder_is_a_line(flight: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["export-gcp", "bias-report"])
-def test_a_command_before_detect_is_a_line(flight: Path, command: str) -> None:
+def test_commands_that_need_detections_fail_in_one_line_before_detect(
+    flight: Path, command: str
+) -> None:
     assert "run 'kgcp detect'" in one_line_of_error(run(command, str(flight)))
 
 
@@ -123,7 +125,7 @@ def test_frames_of_another_size_end_the_run_early(flight: Path) -> None:
         (30, [(WIDTH, HEIGHT), (9, 9)], 15),
     ],
 )
-def test_other_flights_are_looked_at_to_their_end(
+def test_a_run_continues_if_some_frames_have_the_stated_size(
     flight: Path, count: int, sizes: list[tuple[int, int]], rows: int
 ) -> None:
     sized(flight, count, *sizes)

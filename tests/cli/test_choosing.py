@@ -19,7 +19,7 @@ from tests.cli.conftest import FRAMES, SampleFlight
 FEW = ("--frames", "*_000[06].jpg", "--frames", "frame_0000*", "--jobs", "0")
 
 
-def test_patterns_choose_by_the_whole_path() -> None:
+def test_frame_patterns_match_the_whole_path() -> None:
     frames = ["a/1.jpg", "a/2.jpg", "b/1.JPG"]
     assert matching_frames(frames, ()) == frames
     assert matching_frames(frames, ("*1.jpg",)) == ["a/1.jpg"]
@@ -29,7 +29,7 @@ def test_patterns_choose_by_the_whole_path() -> None:
         matching_frames(frames, ("a/*", "2.jpg"))
 
 
-def test_some_frames_make_a_table_that_belongs_to_the_flight(unmeasured: SampleFlight) -> None:
+def test_a_table_of_selected_frames_is_accepted_for_the_flight(unmeasured: SampleFlight) -> None:
     assert "matches none of 5 frames (" in unmeasured.fails("detect", "--frames", "DJI*")
     result = unmeasured.run("detect", *FEW, "--json")
     assert result.exit_code == 0, result.stderr
@@ -64,7 +64,7 @@ class Impatient(NoProgress):
             raise KeyboardInterrupt
 
 
-def test_all_frames_go_on_where_some_frames_were_interrupted(
+def test_a_run_over_all_frames_resumes_an_interrupted_selection(
     unmeasured: SampleFlight, tmp_path: Path
 ) -> None:
     flight = read_flight(unmeasured.path)

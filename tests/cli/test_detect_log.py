@@ -24,13 +24,13 @@ def test_a_wait_is_explained_until_a_frame_is_done(capsys: pytest.CaptureFixture
         assert "compiles" not in capsys.readouterr().err
 
 
-def test_quiet_runs_explain_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+def test_quiet_runs_do_not_explain_waits(capsys: pytest.CaptureFixture[str]) -> None:
     with log_to_stderr(is_quiet=True, as_json=False) as log:
         log.explain_wait()
     assert not capsys.readouterr().err
 
 
-def test_a_stopped_run_tells_how_far_it_came(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_stopped_run_reports_its_progress(capsys: pytest.CaptureFixture[str]) -> None:
     with log_to_stderr(is_quiet=False, as_json=False) as log:
         for total, text in ((1, "0 of 1 frame processed"), (12, "0 of 12 frames processed")):
             log.progress("second look", 0, total, 0)
@@ -72,14 +72,14 @@ def test_one_bar_goes_through_all_stages(
     assert shown == expected
 
 
-def test_frames_kept_from_before_are_not_counted_as_speed() -> None:
+def test_frames_from_an_earlier_run_do_not_count_in_the_speed() -> None:
     with log_to_stderr(is_quiet=True, as_json=False) as log:
         log.progress("first look", 6, 9, found=2)
         assert (log._bar.initial, log._bar.n) == (6, 6)
 
 
 @pytest.mark.parametrize(("kept", "speed"), [(0, " (0.5/s)"), (1, "")])
-def test_a_speed_is_told_of_frames_that_were_worked_on(
+def test_the_speed_is_that_of_the_frames_processed_in_this_run(
     kept: int, speed: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     summary = SummaryBuilder({}).summary(

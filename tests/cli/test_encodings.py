@@ -19,7 +19,7 @@ def printed(to: io.TextIOWrapper, text: str) -> str:
 
 
 @pytest.mark.parametrize("errors", ["strict", "surrogateescape", "backslashreplace"])
-def test_what_a_code_page_lacks_is_printed_in_ascii(errors: str) -> None:
+def test_characters_missing_in_a_code_page_are_printed_in_ascii(errors: str) -> None:
     page = stream("cp1252", errors)
     print_anything(page)
     assert printed(page, "−1.5 m ± 2 µm, 90°, σ ≥ 3, a → b, č, 地") == (
@@ -39,7 +39,7 @@ def test_unicode_is_printed_as_it_is_and_undecodable_names_end_nothing() -> None
     assert printed(page, "−5 → \udcff.jpg") == "−5 → ?.jpg"
 
 
-def test_a_handler_that_was_chosen_stays() -> None:
+def test_an_error_handler_of_the_stream_is_not_replaced() -> None:
     page = stream("cp1252", "ignore")
     print_anything(page)
     assert printed(page, "−5") == "5"

@@ -109,7 +109,7 @@ def _export(folder: Path, *options: str) -> Result:
     return result
 
 
-def test_the_summary_says_what_to_change_and_heeding_it_ends_it(folder: Path) -> None:
+def test_advice_of_the_summary_disappears_once_it_is_followed(folder: Path) -> None:
     result = _export(folder, "--json")
     (line,) = json.loads(result.stdout)["advice"]
     assert "kgcp: doubt: vehicle and camera differ by 0.303 m along, " in result.stderr
@@ -142,7 +142,7 @@ def test_the_summary_says_how_well_the_points_are_known(folder: Path) -> None:
     assert line in stderr
 
 
-def test_files_that_cannot_be_written_are_no_reason_to_leave_a_format_out(folder: Path) -> None:
+def test_a_file_that_cannot_be_written_is_an_error_with_all_formats(folder: Path) -> None:
     (folder / "kgcp" / "odm").write_text("a file, where a folder must be")
     result = CliRunner().invoke(main, ["export-gcp", str(folder), "--format", "all"])
     assert result.exit_code == 1
@@ -160,7 +160,7 @@ def test_another_results_folder_needs_the_table_of_detections(folder: Path, comm
     )
 
 
-def test_without_any_table_detections_are_to_be_made(folder: Path) -> None:
+def test_without_any_table_the_error_advises_to_run_detect(folder: Path) -> None:
     table = folder / "kgcp" / "detections.parquet"
     _export(folder, "--out", str(folder / "other"), "--detections", str(table))
     table.unlink()
@@ -170,7 +170,7 @@ def test_without_any_table_detections_are_to_be_made(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("flights", [1, 2])
-def test_the_consistency_of_an_earlier_export_does_not_stay(
+def test_the_consistency_file_of_an_earlier_export_is_removed(
     folder: Path, tmp_path: Path, flights: int
 ) -> None:
     _export(folder)
@@ -186,7 +186,7 @@ def test_the_consistency_of_an_earlier_export_does_not_stay(
     assert not any(file.exists() for file in files)
 
 
-def test_jumps_are_left_out_counted_and_may_be_kept(folder: Path) -> None:
+def test_jumps_are_excluded_and_counted_unless_they_are_to_be_kept(folder: Path) -> None:
     summary = json.loads(_export(folder, "--json").stdout)
     assert summary["skipped"] == {"distance_jump": 1}
     assert summary["kgcps"] == _FRAMES - 1
@@ -201,7 +201,7 @@ def test_jumps_are_left_out_counted_and_may_be_kept(folder: Path) -> None:
     assert {float(row["sd_common_x"]) for row in rows} == {0.0}  # neither arm nor clock has any
 
 
-def test_gates_spacing_and_check_points(folder: Path) -> None:
+def test_gates_spacing_and_check_points_select_points(folder: Path) -> None:
     options = ("--min-score", "0.9", "--min-spacing", "30", "--checkpoints", "0.25", "--json")
     summary = json.loads(_export(folder, *options).stdout)
     assert summary["skipped"]["low_score"] == 1
@@ -220,7 +220,7 @@ def test_gates_spacing_and_check_points(folder: Path) -> None:
     assert "no points left" in strict.stderr
 
 
-def test_points_in_another_crs_are_the_same_places(folder: Path) -> None:
+def test_points_exported_in_another_crs_are_the_same_places(folder: Path) -> None:
     _export(folder)
     path = folder / "kgcp" / "kgcps.parquet"
     here = read_table(path, GCP_COLUMNS)
@@ -241,7 +241,7 @@ def test_points_in_another_crs_are_the_same_places(folder: Path) -> None:
         assert stream.read().count("EPSG:4326") == _FRAMES - 1
 
 
-def test_a_crs_that_cannot_be_used_is_one_line(folder: Path) -> None:
+def test_an_unusable_crs_is_a_one_line_error(folder: Path) -> None:
     for crs in ("nonsense", "EPSG:2263", "EPSG:4978"):
         result = CliRunner().invoke(main, ["export-gcp", str(folder), "--crs", crs])
         assert result.exit_code == 1

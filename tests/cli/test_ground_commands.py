@@ -157,7 +157,7 @@ def test_odm_list_follows_its_grammar(flight: FlightFolder) -> None:
     assert all(len(cell.partition(".")[2]) >= 3 for cell in points[0][:3])
 
 
-def test_wgs84_utm_gets_the_header_that_no_reader_mistakes(flight: FlightFolder) -> None:
+def test_wgs84_utm_gets_an_unambiguous_odm_header(flight: FlightFolder) -> None:
     flight.edit("EPSG:25831", "EPSG:32631")
     flight.run("export-gcp")
     text = (flight.out / "odm/gcp_list.txt").read_text(encoding="utf-8")
@@ -189,7 +189,7 @@ def test_a_static_target_is_one_point_with_many_rays(flight: FlightFolder) -> No
     assert {line.split()[6] for line in lines} == {"A"}
 
 
-def test_all_formats_leave_out_what_these_points_do_not_fit(flight: FlightFolder) -> None:
+def test_all_formats_skips_formats_that_cannot_hold_the_points(flight: FlightFolder) -> None:
     result = flight.run("export-gcp", "--format", "all")
     assert result.exit_code == 0, result.output
     assert "left out colmap: there is no camera position" in result.stderr
@@ -212,7 +212,9 @@ def test_names_of_images_may_lack_their_extension(flight: FlightFolder) -> None:
         assert " f_0.jpg K0001" in points, "ODM knows files"
 
 
-def test_marks_of_packages_have_a_floor_and_the_table_has_not(flight: FlightFolder) -> None:
+def test_image_accuracies_have_a_minimum_in_packages_but_not_in_the_table(
+    flight: FlightFolder,
+) -> None:
     for options, accuracy in ((), 0.1), (("--mark-floor-px", "0.3"), 0.3):
         assert flight.run("export-gcp", "--format", "pix4d", *options).exit_code == 0
         with (flight.out / "pix4d/marks.csv").open(encoding="utf-8") as stream:
@@ -246,7 +248,7 @@ def test_frames_outside_the_trajectory_are_counted(flight: FlightFolder) -> None
     assert "1 before_trajectory" in result.stderr
 
 
-def test_bad_input_is_one_line_with_a_remedy(flight: FlightFolder) -> None:
+def test_bad_input_is_a_one_line_error_with_a_remedy(flight: FlightFolder) -> None:
     flight.edit("EPSG:25831", "EPSG:99999")
     assert "EPSG:99999" in flight.fails("export-gcp")
     flight.edit("EPSG:99999", "EPSG:25831")
@@ -265,7 +267,7 @@ def test_bad_input_is_one_line_with_a_remedy(flight: FlightFolder) -> None:
     assert "kgcp detect" in flight.fails("bias-report")
 
 
-def test_a_flight_without_crs_or_times_says_so(flight: FlightFolder) -> None:
+def test_a_flight_without_crs_or_times_is_reported(flight: FlightFolder) -> None:
     flight.detect(lambda row: row.update(time=None))
     assert "no frame has a time" in flight.fails("export-gcp")
     flight.edit('crs = "EPSG:25831"\n', "")
@@ -310,7 +312,7 @@ def test_the_same_input_makes_the_same_bytes(flight: FlightFolder, tmp_path: Pat
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
 
 
-def test_a_flight_without_reference_says_so(flight: FlightFolder) -> None:
+def test_a_flight_without_reference_poses_is_reported(flight: FlightFolder) -> None:
     flight.edit('[reference]\nposes = "reference.csv"\n', "")
     assert "[reference]" in flight.fails("bias-report")
 

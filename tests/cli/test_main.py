@@ -35,7 +35,7 @@ def run_raising(error: BaseException) -> tuple[int, str, str]:
     return result.exit_code, result.stdout, result.stderr
 
 
-def test_a_known_error_is_one_line_and_exit_1() -> None:
+def test_a_known_error_is_printed_in_one_line_with_exit_code_1() -> None:
     error = KgcpError("flight.toml: [camera] fx: is missing; give it\nas a number")
     assert run_raising(error) == (
         1,
@@ -50,7 +50,7 @@ def test_an_error_names_the_option_that_helps() -> None:
     assert run_raising(error)[2].endswith("; choose another results folder (--out)\n")
 
 
-def test_a_known_warning_is_one_line_and_the_work_goes_on() -> None:
+def test_a_known_warning_is_printed_in_one_line_and_does_not_stop_the_command() -> None:
     class OneCommand(Program):
         def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command:  # noqa: ARG002 - click's signature
             @click.command(cmd_name)
@@ -65,7 +65,7 @@ def test_a_known_warning_is_one_line_and_the_work_goes_on() -> None:
     assert result.stderr == "kgcp: warning: leap seconds are known until 2027\n"
 
 
-def test_an_interrupt_is_one_line_and_exit_130() -> None:
+def test_an_interrupt_is_printed_in_one_line_with_exit_code_130() -> None:
     code, out, err = run_raising(KeyboardInterrupt())
     assert (code, out, err.count("\n")) == (130, "", 1)
     assert err.startswith("kgcp: interrupted")
@@ -76,7 +76,7 @@ def test_an_unexpected_error_keeps_its_traceback() -> None:
         run_raising(ZeroDivisionError())
 
 
-def test_wrong_usage_is_click_s_exit_2() -> None:
+def test_wrong_usage_ends_with_click_s_exit_code_2() -> None:
     assert CliRunner().invoke(main, ["detekt"]).exit_code == 2
     assert CliRunner().invoke(main, ["detect", "--no-such-option"]).exit_code == 2
 
@@ -177,7 +177,7 @@ def test_detection_runs_where_standard_streams_are_closed(
     assert (unmeasured.out / "detections.parquet").is_file()
 
 
-def test_the_module_runs_and_knows_its_version() -> None:
+def test_the_module_can_be_run_and_prints_its_version() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "kgcp", "--version"], capture_output=True, text=True, check=True
     )

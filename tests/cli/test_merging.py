@@ -65,7 +65,7 @@ def test_excluded_frames_are_counted_with_their_own_reason(
     assert list(points["id"]) == ["K0003", "K0005"]
 
 
-def test_names_that_mean_nothing_are_told(measured: SampleFlight) -> None:
+def test_excluded_names_without_a_row_cause_a_warning(measured: SampleFlight) -> None:
     file = listed(measured.path, f"{FRAMES[0].upper()}\n{FRAMES[1]},B\n{FRAMES[2]}\n")
     result = measured.run("export-gcp", "--exclude", str(file), "--json")
     assert "kgcp: warning: 2 lines of the list of frames to leave out name no row" in result.stderr
@@ -86,7 +86,9 @@ def test_names_that_mean_nothing_are_told(measured: SampleFlight) -> None:
         ("x" * 200_000, "line 1: field larger than field limit"),
     ],
 )
-def test_faulty_lists_are_errors(measured: SampleFlight, text: str, words: str) -> None:
+def test_malformed_exclusion_lists_are_errors(
+    measured: SampleFlight, text: str, words: str
+) -> None:
     file = listed(measured.path, text)
     assert words in measured.fails("export-gcp", "--exclude", str(file))
     assert "does not exist" in measured.fails("export-gcp", "--exclude", "nowhere.csv")
@@ -99,7 +101,9 @@ def test_ids_may_begin_with_the_flights_name(measured: SampleFlight) -> None:
     assert "sample-K0001" in (measured.out / "odm" / "gcp_list.txt").read_text(encoding="utf-8")
 
 
-def test_two_flights_are_one_set(two: tuple[SampleFlight, SampleFlight], tmp_path: Path) -> None:
+def test_two_flights_are_merged_into_one_set(
+    two: tuple[SampleFlight, SampleFlight], tmp_path: Path
+) -> None:
     north, south = two
     south.edit(("[-0.8, 0.15, -1.95]", "[-0.8, 0.65, -1.95]"))
     out = tmp_path / "block"
@@ -120,7 +124,7 @@ def test_two_flights_are_one_set(two: tuple[SampleFlight, SampleFlight], tmp_pat
         assert (out / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
 
 
-def test_an_excluded_frame_is_of_one_flight(
+def test_excluding_a_frame_affects_one_flight_only(
     two: tuple[SampleFlight, SampleFlight], tmp_path: Path
 ) -> None:
     places = [flight.path for flight in two]
@@ -137,7 +141,7 @@ def test_an_excluded_frame_is_of_one_flight(
     assert "south_bank-K0001" not in ids
 
 
-def test_flights_that_cannot_be_one_set(
+def test_flights_that_cannot_be_merged_are_refused(
     two: tuple[SampleFlight, SampleFlight], tmp_path: Path
 ) -> None:
     north, south = two
@@ -175,7 +179,7 @@ def test_a_static_target_of_two_flights_is_one_point(
     assert f"static target 'A' has different positions in north/{FRAMES[0]} and south_bank/" in line
 
 
-def test_flights_of_two_cameras_are_merged_where_files_hold_none(
+def test_flights_of_two_cameras_merge_in_formats_without_cameras(
     two: tuple[SampleFlight, SampleFlight], tmp_path: Path
 ) -> None:
     north, south = two
@@ -191,7 +195,7 @@ def test_flights_of_two_cameras_are_merged_where_files_hold_none(
     assert not (block / "metashape" / "markers.xml").exists()
 
 
-def test_formats_of_one_camera_are_known(
+def test_formats_limited_to_one_camera_are_known(
     two: tuple[SampleFlight, SampleFlight], tmp_path: Path
 ) -> None:
     """Every format but those named writes the same, whatever the camera is."""

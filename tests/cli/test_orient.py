@@ -83,7 +83,7 @@ def poses_of(folder: Path, flight: GroundFlight) -> tuple[np.ndarray, np.ndarray
 @pytest.mark.parametrize(
     ("stated_m", "words"), [(0.9, ""), (0.899, "1.1 ‰"), (0.897, "3.4 ‰"), (0.906, "6.6 ‰")]
 )
-def test_diameters_that_are_all_wrong_displace_no_pose(
+def test_a_common_error_of_all_diameters_displaces_no_pose(
     tmp_path: Path, stated_m: float, words: str
 ) -> None:
     """Nobody states how well these rings are printed: 'place' measures it by such poses."""
@@ -121,7 +121,7 @@ def misplace(folder: Path, flight: GroundFlight, off_m: FloatArray) -> None:
         (0.002, 0.5, "B left out in 1"),
     ],
 )
-def test_a_height_that_is_wrong_does_not_pass_in_silence(
+def test_a_wrong_height_is_reported(
     tmp_path: Path, sd_position_m: float, off_m: float, words: str
 ) -> None:
     """Of four targets nearly in a plane: the poses take up most of it, frame by frame."""
@@ -151,7 +151,7 @@ def test_positions_as_good_as_stated_contradict_nothing(tmp_path: Path, seed: in
     assert 0.2 < float(np.sqrt(np.mean((off / sds) ** 2))) < 1.7
 
 
-def test_where_most_frames_cannot_be_oriented_that_is_told(tmp_path: Path) -> None:
+def test_a_failure_to_orient_most_frames_is_reported(tmp_path: Path) -> None:
     exchanged = {
         (frame, name): other for frame in range(8) for name, other in (("A", "B"), ("B", "A"))
     }
@@ -167,7 +167,7 @@ def test_where_most_frames_cannot_be_oriented_that_is_told(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("options", [(), ("--free-focal",)])
 @pytest.mark.parametrize("pair", ["AB", "AC"])
-def test_two_of_four_names_that_are_exchanged_in_a_third_of_the_frames(
+def test_frames_with_two_of_four_names_exchanged_are_not_oriented(
     tmp_path: Path, pair: str, options: tuple[str, ...]
 ) -> None:
     """These frames are refused: two of four do not tell which two are right."""
@@ -183,7 +183,7 @@ def test_two_of_four_names_that_are_exchanged_in_a_third_of_the_frames(
     assert 0.1 < np.nanmax(np.abs(off / sds)) < 3.0
 
 
-def test_distances_that_contradict_an_unknown_focal_length_are_told(tmp_path: Path) -> None:
+def test_distances_that_contradict_the_estimated_focal_length_are_reported(tmp_path: Path) -> None:
     """Positions and images determine the focal length; half the diameter contradicts them."""
     flight = GroundFlight(stated_diameter_m=0.45, frames=4)
     folder = flight.write(tmp_path / "flight", sd_position_m=0.002)
@@ -199,7 +199,7 @@ def vouch(folder: Path, sd_diameter_m: float) -> None:
     toml.write_text(toml.read_text("utf-8").replace("\nposition_m", words), encoding="utf-8")
 
 
-def test_a_print_that_is_stated_after_detection_is_not_exact(tmp_path: Path) -> None:
+def test_a_diameter_accuracy_added_after_detection_is_used(tmp_path: Path) -> None:
     flight = GroundFlight(stated_diameter_m=0.897, frames=6)
     folder = flight.write(tmp_path / "flight")
     vouch(folder, 0.003)
@@ -208,7 +208,7 @@ def test_a_print_that_is_stated_after_detection_is_not_exact(tmp_path: Path) -> 
     assert 0.2 < float(np.sqrt(np.mean((off[:, 2] / sds[:, 2]) ** 2))) < 1.5
 
 
-def test_diameters_that_contradict_what_is_vouched_for_are_told_in_permille(tmp_path: Path) -> None:
+def test_contradictions_of_accurate_diameters_are_reported_in_permille(tmp_path: Path) -> None:
     flight = GroundFlight(stated_diameter_m=0.897, frames=3)
     folder = flight.write(tmp_path / "flight", sd_position_m=0.002)
     vouch(folder, 0.0001)
@@ -217,7 +217,7 @@ def test_diameters_that_contradict_what_is_vouched_for_are_told_in_permille(tmp_
     assert "the distances are 3 ‰ shorter than the positions say" in result.stderr
 
 
-def test_diameters_that_are_vouched_for_tell_how_far_away_a_frame_is(tmp_path: Path) -> None:
+def test_accurate_diameters_determine_the_distance_of_a_frame(tmp_path: Path) -> None:
     flight, found = GroundFlight(frames=4), []
     for name in ("open", "stated"):
         folder = flight.write(tmp_path / name, sd_position_m=0.002)
@@ -228,7 +228,7 @@ def test_diameters_that_are_vouched_for_tell_how_far_away_a_frame_is(tmp_path: P
     assert found[1] < 0.7 * found[0]
 
 
-def test_radii_in_the_place_of_diameters_are_told(tmp_path: Path) -> None:
+def test_radii_entered_as_diameters_are_reported(tmp_path: Path) -> None:
     folder = GroundFlight(stated_diameter_m=0.45, frames=3).write(tmp_path / "flight")
     result = run("orient", folder)
     assert result.exit_code == 1
@@ -238,7 +238,7 @@ def test_radii_in_the_place_of_diameters_are_told(tmp_path: Path) -> None:
     assert result.stderr.count("\n") == 1
 
 
-def test_a_wrong_name_is_left_out(tmp_path: Path) -> None:
+def test_a_target_with_a_wrong_name_is_left_out(tmp_path: Path) -> None:
     wrong = {(2, "B"): np.array([0.5, 0.3, 0.0])}
     folder = GroundFlight(wrong=wrong).write(tmp_path / "flight")
     result = run("orient", folder, "--frames", "f_00[1-3].png", "--min-points", "3", "--json")
@@ -260,7 +260,7 @@ def test_a_wrong_name_is_left_out(tmp_path: Path) -> None:
     assert (table["residual_distance_percent"][table["used"]].abs() < 0.5).all()
 
 
-def test_a_target_that_is_elsewhere_is_told_once(tmp_path: Path) -> None:
+def test_a_misplaced_target_is_reported_once_for_all_frames(tmp_path: Path) -> None:
     folder = GroundFlight(wrong={(frame, "B"): np.array([0.5, 0.3, 0.0]) for frame in range(5)})
     result = run("orient", folder.write(tmp_path / "flight"))
     assert result.exit_code == 0, result.stderr
@@ -269,7 +269,7 @@ def test_a_target_that_is_elsewhere_is_told_once(tmp_path: Path) -> None:
     assert result.stderr.count("left out") == 1
 
 
-def test_two_names_exchanged_in_a_frame_orient_it_by_no_ring(tmp_path: Path) -> None:
+def test_a_frame_with_two_exchanged_names_is_not_oriented_by_a_single_ring(tmp_path: Path) -> None:
     folder = GroundFlight(frames=6).write(tmp_path / "flight", sd_position_m=0.002)
     path = folder / "kgcp" / "detections.parquet"
     table = read_detections(path)
@@ -295,7 +295,7 @@ def test_two_names_exchanged_in_a_frame_orient_it_by_no_ring(tmp_path: Path) -> 
         (lambda table: table.assign(x_px=1e300), "x_px of a measured row"),
     ],
 )
-def test_one_line_for_detections_that_cannot_be(
+def test_impossible_detections_are_a_one_line_error(
     tmp_path: Path, change: Callable[[pd.DataFrame], pd.DataFrame], problem: str
 ) -> None:
     folder = GroundFlight(frames=3).write(tmp_path / "flight")
@@ -328,7 +328,7 @@ def test_an_unknown_focal_length_is_found_where_the_ground_is_not_flat(tmp_path:
     assert focal["sd"] < 20.0
 
 
-def test_nothing_to_orient_by_is_one_line(tmp_path: Path) -> None:
+def test_a_lack_of_frames_or_static_targets_is_a_one_line_error(tmp_path: Path) -> None:
     folder = GroundFlight(frames=4).write(tmp_path / "flight")
     result = run("orient", folder, "--frames", "x*")
     assert result.exit_code == 1
@@ -394,7 +394,7 @@ def test_a_device_orients_a_frame_whatever_the_focal_length(tmp_path: Path) -> N
         (("--unit", "mm"), "--unit applies to --field only;"),
     ],
 )
-def test_options_that_do_not_go_together(
+def test_conflicting_options_are_usage_errors(
     tmp_path: Path, options: tuple[str, ...], message: str
 ) -> None:
     result = run("orient", tmp_path, *options)
@@ -440,7 +440,7 @@ def field_flight(rendered_field: tuple[Path, list[Pose]], tmp_path: Path) -> Pat
     return Path(shutil.copytree(rendered_field[0], tmp_path / "flight"))
 
 
-def test_a_field_orients_frames_in_its_own_frame(
+def test_a_field_gives_poses_in_its_own_coordinate_frame(
     field_flight: Path, rendered_field: tuple[Path, list[Pose]]
 ) -> None:
     folder, (_, poses) = field_flight, rendered_field
@@ -489,7 +489,7 @@ def test_a_field_whose_discs_have_another_size_than_stated_is_doubted(
     assert words in result.stderr
 
 
-def test_a_field_without_a_mark_does_not_tell_how_it_lies(field_flight: Path) -> None:
+def test_a_field_without_a_mark_does_not_determine_its_orientation(field_flight: Path) -> None:
     result = run("orient", field_flight, "--field", "grid:5x4:30mm:16mm")
     assert result.exit_code == 1
     assert "the field looks the same turned, and nothing tells how it lies" in result.stderr
@@ -505,7 +505,7 @@ def test_a_symmetric_device_is_refused(tmp_path: Path) -> None:
     assert "looks the same with its points 1, 2, 3, 4 exchanged" in result.stderr
 
 
-def test_the_example_of_the_page_runs_from_end_to_end(tmp_path: Path) -> None:
+def test_the_example_in_the_documentation_runs(tmp_path: Path) -> None:
     page = Path(__file__).resolve().parents[2] / "docs" / "ground.md"
     example = page.read_text(encoding="utf-8").partition("## From end to end")[2]
     text = example.partition("##")[0]

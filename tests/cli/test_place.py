@@ -198,7 +198,7 @@ def stepped(names: str, steps_m: FloatArray, *, seed: int = 1) -> GroundFlight:
         ("ABC", 0.01, 8),
     ],
 )
-def test_poses_that_step_move_no_target(
+def test_a_step_in_the_poses_is_not_taken_for_a_moved_target(
     tmp_path: Path, names: str, size_m: float, frames: int
 ) -> None:
     steps_m = np.outer(np.arange(12) >= frames, [size_m, 0.0, 0.0])
@@ -224,7 +224,7 @@ def test_poses_that_step_move_no_target(
 
 @pytest.mark.usefixtures("_no_figures")
 @pytest.mark.parametrize("names", ["A", "AB"])
-def test_poses_that_drift_leave_honest_deviations(tmp_path: Path, names: str) -> None:
+def test_standard_deviations_cover_drifting_poses(tmp_path: Path, names: str) -> None:
     ratios = []
     for seed in range(4):
         rng = np.random.default_rng(seed)
@@ -242,7 +242,7 @@ def test_poses_that_drift_leave_honest_deviations(tmp_path: Path, names: str) ->
 
 
 @pytest.mark.usefixtures("_no_figures")
-def test_a_step_that_stated_deviations_explain_is_no_doubt(tmp_path: Path) -> None:
+def test_a_step_within_the_stated_deviations_raises_no_doubt(tmp_path: Path) -> None:
     flight = stepped("A", np.outer(np.arange(12) >= 6, [0.02, 0.0, 0.0]))
     folder = flight.write(tmp_path / "flight")
     path = folder / "reference.csv"
@@ -256,7 +256,7 @@ def test_a_step_that_stated_deviations_explain_is_no_doubt(tmp_path: Path) -> No
 
 @pytest.mark.usefixtures("_no_figures")
 @pytest.mark.parametrize(("frames", "off_m"), [(4, 0.5), (6, 1.0)])
-def test_a_single_target_moves_by_more_than_poses_step(
+def test_a_step_of_a_single_target_is_taken_for_a_moved_target(
     tmp_path: Path, frames: int, off_m: float
 ) -> None:
     flight = stepped("A", np.outer(np.arange(12) >= frames, [off_m, 0.0, 0.0]))
@@ -308,7 +308,7 @@ def test_contradictions_that_frames_share_are_not_reduced_by_more_frames(
 
 
 @pytest.mark.usefixtures("_no_figures")
-def test_deviations_of_poses_count(tmp_path: Path) -> None:
+def test_stated_deviations_of_poses_are_used(tmp_path: Path) -> None:
     folder = GroundFlight().write(tmp_path / "flight")
     path = folder / "reference.csv"
     head, *lines = path.read_text(encoding="utf-8").splitlines()
@@ -329,7 +329,7 @@ def test_deviations_of_poses_count(tmp_path: Path) -> None:
         (False, "all rays start at one place"),
     ],
 )
-def test_poses_of_other_frames_are_no_poses(
+def test_poses_assigned_to_other_frames_are_refused(
     tmp_path: Path, problem: str, *, is_shifted: bool
 ) -> None:
     folder = GroundFlight(frames=3).write(tmp_path / "flight")
@@ -354,7 +354,7 @@ def test_poses_of_other_frames_are_no_poses(
         (("--poses", "."), ".: is no file; name a file of poses (--poses)"),
     ],
 )
-def test_what_cannot_be_placed_is_one_line(
+def test_targets_that_cannot_be_placed_are_a_one_line_error(
     tmp_path: Path, arguments: tuple[str, ...], problem: str
 ) -> None:
     folder = GroundFlight(frames=12).write(tmp_path / "flight")
@@ -372,7 +372,7 @@ def test_options_that_name_nothing_to_place_are_usage_errors(
     assert run(folder, *option).exit_code == 2
 
 
-def test_names_of_targets_are_not_formulas(tmp_path: Path) -> None:
+def test_target_names_cannot_become_spreadsheet_formulas(tmp_path: Path) -> None:
     folder = GroundFlight(names=("P$^$", "B", "C", "D")).write(tmp_path / "flight")
     result = run(folder)
     assert result.exit_code == 0, result.stderr
@@ -388,7 +388,7 @@ def test_files_of_an_earlier_run_are_named(tmp_path: Path) -> None:
     assert json.loads(result.stdout)["not_renewed"] == ["odm"]
 
 
-def test_without_a_readable_frame_that_is_said(tmp_path: Path) -> None:
+def test_a_flight_without_a_readable_frame_is_reported(tmp_path: Path) -> None:
     folder = GroundFlight(frames=3).write(tmp_path / "flight")
     path = folder / "kgcp" / "detections.parquet"
     table = pq.read_table(path)

@@ -54,7 +54,7 @@ def test_the_table_has_a_line_per_height_and_its_conditions(flight: Path) -> Non
     assert max(map(len, lines)) <= 100
 
 
-def test_a_layout_that_is_hard_to_find_is_told(flight: Path) -> None:
+def test_a_layout_that_is_hard_to_find_causes_a_warning(flight: Path) -> None:
     text = FLIGHT.replace(f"inner_diameter_m = {0.45}", "inner_diameter_m = 0.3")
     assert text != FLIGHT
     (flight / "flight.toml").write_text(text, encoding="utf-8")
@@ -156,14 +156,16 @@ def test_the_same_plan_is_the_same_figure(flight: Path) -> None:
         (["--target", "B"], "'B' is not in flight.toml; give one of A"),
     ],
 )
-def test_impossible_inputs_are_one_line(flight: Path, arguments: list[str], words: str) -> None:
+def test_impossible_inputs_are_a_one_line_error(
+    flight: Path, arguments: list[str], words: str
+) -> None:
     result = run(flight, *arguments)
     assert result.exit_code == 1
     assert words in result.stderr
     assert result.stderr.count("\n") == 1
 
 
-def test_a_flight_without_camera_is_told_so(flight: Path) -> None:
+def test_a_flight_without_camera_is_reported(flight: Path) -> None:
     (flight / "flight.toml").write_text(FLIGHT.partition("[[")[2].join(["[[", ""]), "utf-8")
     result = run(flight)
     assert result.exit_code == 1
@@ -181,7 +183,7 @@ position_m = [1.0, 2.0, 3.0]
 """
 
 
-def test_plans_for_a_plain_target(flight: Path) -> None:
+def test_a_plan_for_a_plain_target_has_its_limit_and_accuracy(flight: Path) -> None:
     text = (flight / "flight.toml").read_text(encoding="utf-8")
     (flight / "flight.toml").write_text(text + PLAIN, encoding="utf-8")
     heights = [option for height in (20, 142, 143) for option in ("--height", str(height))]

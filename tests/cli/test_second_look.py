@@ -54,7 +54,7 @@ def detect(flight: Path, out: Path, *options: str) -> Result:
     return CliRunner().invoke(main, arguments, catch_exceptions=False)
 
 
-def test_neighbours_lead_to_the_target_in_haze(flight: Path, tmp_path: Path) -> None:
+def test_neighbouring_frames_lead_to_a_target_in_haze(flight: Path, tmp_path: Path) -> None:
     result = detect(flight, tmp_path, "--overlay", str(tmp_path / "sheet"), "--all-candidates")
     assert json.loads(result.stdout)["guided"] == 1
     assert "1 of them measured in the second pass" in result.stderr
@@ -70,7 +70,9 @@ def test_neighbours_lead_to_the_target_in_haze(flight: Path, tmp_path: Path) -> 
     assert page.count('class="measured"') == FRAMES
 
 
-def test_without_the_second_look_it_is_missed_and_explained(flight: Path, tmp_path: Path) -> None:
+def test_without_the_second_look_the_hazy_target_is_a_miss_with_a_reason(
+    flight: Path, tmp_path: Path
+) -> None:
     result = detect(flight, tmp_path, "--no-guided")
     assert json.loads(result.stdout)["guided"] == 0
     rows = pd.read_parquet(tmp_path / "detections.parquet").set_index("frame")
@@ -79,14 +81,18 @@ def test_without_the_second_look_it_is_missed_and_explained(flight: Path, tmp_pa
     assert not rows["guided"].any()
 
 
-def test_a_chance_that_nothing_meets_leaves_nothing(flight: Path, tmp_path: Path) -> None:
+def test_an_extremely_small_false_alarm_limit_rejects_every_target(
+    flight: Path, tmp_path: Path
+) -> None:
     detect(flight, tmp_path, "--false-alarm", "1e-60")
     rows = pd.read_parquet(tmp_path / "detections.parquet")
     assert (rows["status"] != "measured").all()
     assert rows["detail"].str.contains("occurs by chance").sum() == FRAMES - 1
 
 
-def test_an_impossible_chance_is_refused_in_one_line(flight: Path, tmp_path: Path) -> None:
+def test_an_impossible_false_alarm_limit_is_refused_in_one_line(
+    flight: Path, tmp_path: Path
+) -> None:
     result = detect(flight, tmp_path, "--false-alarm", "0")
     assert result.exit_code == 1
     assert "--false-alarm: 0 is out of range; give a value above 0 and at most 1" in result.stderr

@@ -59,7 +59,7 @@ def test_wrong_options_are_usage_errors(tmp_path: Path, option: list[str]) -> No
     assert result.exit_code == 2
 
 
-def test_a_range_that_is_turned_round_ends_in_one_line(tmp_path: Path) -> None:
+def test_a_reversed_range_is_a_one_line_error(tmp_path: Path) -> None:
     arguments = ["simulate", str(tmp_path / "flight"), "--gain", "2", "1", "--frames", "1"]
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 1
@@ -68,7 +68,7 @@ def test_a_range_that_is_turned_round_ends_in_one_line(tmp_path: Path) -> None:
     assert not (tmp_path / "flight").exists()
 
 
-def test_a_used_folder_ends_in_one_line(tmp_path: Path) -> None:
+def test_a_folder_with_content_is_a_one_line_error(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("")
     result = CliRunner().invoke(main, ["simulate", str(tmp_path), "--frames", "1", "--jobs", "1"])
     assert result.exit_code == 1
@@ -160,7 +160,7 @@ def test_sharpening_is_the_phones_unless_it_is_given(tmp_path: Path, options: st
     assert command in (out / "README.md").read_text(encoding="utf-8")
 
 
-def test_too_much_coma_ends_in_one_line(tmp_path: Path) -> None:
+def test_too_much_coma_is_a_one_line_error(tmp_path: Path) -> None:
     out = str(tmp_path / "flight")
     result = CliRunner().invoke(main, ["simulate", out, "--preset", "lens", "--coma", "0.4"])
     assert result.exit_code == 1
@@ -224,7 +224,7 @@ def test_motion_without_a_rolling_shutter_or_out_of_range_is_refused(
         (["--motion", "30", "-40"], "simulated without motion of the image", 1),
     ],
 )
-def test_what_only_flights_have_ends_in_one_line(
+def test_options_of_flights_are_refused_with_a_field_in_one_line(
     tmp_path: Path, options: list[str], words: str, code: int
 ) -> None:
     arguments = ["simulate", str(tmp_path / "a"), "--field", "grid:3x2:25mm:12mm", *options]

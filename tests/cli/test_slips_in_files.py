@@ -120,7 +120,7 @@ def test_mistakes_in_toml_are_named(unmeasured: SampleFlight, name: str) -> None
 
 
 @pytest.mark.parametrize(("encoding", "words"), [("utf-16", "UTF-16"), ("latin-1", "Latin-1 or")])
-def test_flight_toml_of_another_encoding(
+def test_a_flight_toml_of_another_encoding_is_refused(
     unmeasured: SampleFlight, encoding: str, words: str
 ) -> None:
     unmeasured.edit(('name = "sample"', 'name = "Straße"'))
@@ -129,7 +129,7 @@ def test_flight_toml_of_another_encoding(
     assert re.search(f"is not UTF-8 but .*{words}.*; save it as UTF-8", unmeasured.fails("detect"))
 
 
-def test_a_folder_for_a_calibration(unmeasured: SampleFlight) -> None:
+def test_a_folder_in_place_of_a_calibration_file_is_named(unmeasured: SampleFlight) -> None:
     path = unmeasured.path / "flight.toml"
     text = re.sub(
         r"width = 1200.*p2 = 0.0005", 'file = "frames"', path.read_text(), flags=re.DOTALL
@@ -148,7 +148,9 @@ def test_a_folder_for_a_calibration(unmeasured: SampleFlight) -> None:
         (".pdf", "5 .pdf files; convert them to JPEG, PNG or TIFF, or correct [frames] folder"),
     ],
 )
-def test_what_is_no_image_is_named(unmeasured: SampleFlight, suffix: str, words: str) -> None:
+def test_frames_that_are_no_images_are_named(
+    unmeasured: SampleFlight, suffix: str, words: str
+) -> None:
     for frame in (unmeasured.path / "frames").iterdir():
         frame.rename(frame.with_suffix(suffix))
     assert f"holds no images that kgcp reads, but {words}" in unmeasured.fails("detect")
@@ -198,7 +200,7 @@ def test_the_keys_that_are_named_for_a_gps_week_are_right(measured: SampleFlight
     assert (measured.out / "kgcps.csv").read_bytes() == before
 
 
-def test_a_selection_that_leaves_nothing_tells_the_best(measured: SampleFlight) -> None:
+def test_a_selection_that_rejects_all_points_reports_the_best_one(measured: SampleFlight) -> None:
     line = measured.fails("export-gcp", "--max-sd", "0.001")
     assert re.search(
         r"no points left after selection: 4 uncertain of 4; the best standard deviation is"

@@ -62,7 +62,9 @@ def metadata(path: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_a_change_of_what_was_measured_with_is_refused(measured: SampleFlight, name: str) -> None:
+def test_a_change_of_the_settings_of_the_measurement_is_refused(
+    measured: SampleFlight, name: str
+) -> None:
     changes, words = CHANGES[name]
     measured.edit(*changes)
     for command in ("export-gcp", "bias-report"):
@@ -76,7 +78,7 @@ def test_a_change_of_what_was_measured_with_is_refused(measured: SampleFlight, n
 
 
 @pytest.mark.parametrize("name", HARMLESS)
-def test_what_is_read_anew_may_change(measured: SampleFlight, name: str) -> None:
+def test_inputs_that_are_read_again_may_change(measured: SampleFlight, name: str) -> None:
     measured.edit(*HARMLESS[name])
     result = measured.run("export-gcp", "--format", "csv")
     assert result.exit_code == 0, result.stderr
@@ -130,7 +132,7 @@ def test_the_command_to_repeat_names_folder_and_settings(tmp_path: Path) -> None
     assert line.endswith("(its settings were min_radius_px = 9.0)")
 
 
-def test_tables_say_what_they_were_made_from(measured: SampleFlight) -> None:
+def test_tables_record_what_they_were_made_from(measured: SampleFlight) -> None:
     detections = metadata(measured.out / "detections.parquet")
     assert set(json.loads(detections["digests"])) == (
         {"camera", "targets", "times", "frames", "settings", "version"}

@@ -67,7 +67,7 @@ def read_back(folder: Path, path: Path) -> tuple[Target, ...]:
     return read_printed_targets(folder)
 
 
-def test_words_are_those_of_the_modules() -> None:
+def test_formats_and_papers_of_the_options_are_those_of_the_modules() -> None:
     assert FORMATS == write.FORMATS
     assert tuple(Paper) == PAPERS
 
@@ -85,7 +85,7 @@ def test_targets_of_a_flight_are_written_with_their_tables(flight: Path) -> None
     assert read_back(flight / "again", out / "targets.toml") == read_printed_targets(flight)
 
 
-def test_one_target_in_tiles_on_a_plate(flight: Path, tmp_path: Path) -> None:
+def test_a_single_target_can_be_drawn_in_tiles(flight: Path, tmp_path: Path) -> None:
     options = ("--sheet", "A4", "--tiled", "--plate", "0.4", "--round", "--holes", "6")
     out = tmp_path / "out"
     formats = ("--format", "png", "--format", "svg")
@@ -110,7 +110,7 @@ def test_new_targets_differ_from_the_known_ones(flight: Path, tmp_path: Path) ->
     assert len(read_printed_targets(flight)) == 4, "none of them could be confused"
 
 
-def test_codes_that_are_their_own_image_are_warned_of(flight: Path) -> None:
+def test_codes_with_a_rotational_symmetry_cause_a_warning(flight: Path) -> None:
     text = TABLES.replace("[0, 60, 150, 250]", "[0, 90, 180, 270]")
     (flight / "flight.toml").write_text(text, encoding="utf-8")
     result = run(flight, "--format", "svg")
@@ -136,7 +136,9 @@ def test_codes_that_are_their_own_image_are_warned_of(flight: Path) -> None:
         (["no_such_folder"], "flight.toml: does not exist"),
     ],
 )
-def test_impossible_inputs_are_one_line(flight: Path, arguments: list[str], words: str) -> None:
+def test_impossible_inputs_are_a_one_line_error(
+    flight: Path, arguments: list[str], words: str
+) -> None:
     result = run(*(str(flight) if word == "FLIGHT" else word for word in arguments))
     assert result.exit_code == 1
     assert words in result.stderr

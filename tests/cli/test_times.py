@@ -75,7 +75,9 @@ def test_frames_without_a_line_have_no_time(unmeasured: SampleFlight) -> None:
 @pytest.mark.parametrize(
     ("fallback", "words"), [(False, "it has no time: complete"), (True, "it has EXIF's time:")]
 )
-def test_one_frame_without_a_line(unmeasured: SampleFlight, *, fallback: bool, words: str) -> None:
+def test_a_single_frame_without_a_line_has_no_time(
+    unmeasured: SampleFlight, *, fallback: bool, words: str
+) -> None:
     rewrite(unmeasured, lambda name: "other.jpg" if name == FRAMES[0] else name)
     if fallback:
         unmeasured.edit(('times = "frames.csv"', 'times = "frames.csv"\nexif_fallback = true'))
@@ -84,7 +86,7 @@ def test_one_frame_without_a_line(unmeasured: SampleFlight, *, fallback: bool, w
     assert fallback != ("1 of 5 frames has no time, such as frame_0000.jpg" in stderr)
 
 
-def test_exif_serves_where_it_is_asked_to(unmeasured: SampleFlight) -> None:
+def test_exif_times_are_used_if_exif_fallback_is_set(unmeasured: SampleFlight) -> None:
     rewrite(unmeasured, lambda name: name.upper() if name in FRAMES[:2] else name)
     unmeasured.edit(('times = "frames.csv"', 'times = "frames.csv"\nexif_fallback = true'))
     result = unmeasured.run("detect", *FAST)
@@ -117,7 +119,7 @@ def test_the_key_is_true_or_false(unmeasured: SampleFlight) -> None:
     assert "[frames] exif_fallback: is a text; give true or false" in unmeasured.fails("detect")
 
 
-def test_times_that_a_spreadsheet_has_cut_are_told(unmeasured: SampleFlight) -> None:
+def test_times_truncated_by_a_spreadsheet_are_reported(unmeasured: SampleFlight) -> None:
     path = unmeasured.path / "frames.csv"
     assert "whole seconds" not in unmeasured.run("check").stdout
     path.write_text(re.sub(r"\.\d+Z", "Z", path.read_text(encoding="utf-8")), encoding="utf-8")

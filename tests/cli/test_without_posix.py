@@ -78,7 +78,9 @@ def kgcp(environment: dict[str, str], *arguments: str) -> subprocess.CompletedPr
     )
 
 
-def test_tables_are_the_same(windows: dict[str, str], flight: Path, tmp_path: Path) -> None:
+def test_windows_gives_the_same_tables(
+    windows: dict[str, str], flight: Path, tmp_path: Path
+) -> None:
     run = kgcp(windows, "detect", str(flight), "--jobs", "2")
     assert run.returncode == 0, run.stderr
     out = flight / "kgcp"
@@ -93,7 +95,7 @@ def test_tables_are_the_same(windows: dict[str, str], flight: Path, tmp_path: Pa
     assert (out / "kgcps.parquet").exists()
 
 
-def test_characters_that_a_code_page_lacks_end_no_command(
+def test_characters_missing_in_a_code_page_do_not_stop_a_command(
     windows: dict[str, str], flight: Path
 ) -> None:
     toml = flight / "flight.toml"
@@ -107,7 +109,7 @@ def test_characters_that_a_code_page_lacks_end_no_command(
     )
 
 
-def test_a_flight_begins(windows: dict[str, str], flight: Path, tmp_path: Path) -> None:
+def test_init_works_on_windows(windows: dict[str, str], flight: Path, tmp_path: Path) -> None:
     bare = tmp_path / "bare photos"
     shutil.copytree(flight / "frames", bare)
     shutil.copy(flight / "vehicle.csv", bare)
@@ -117,7 +119,9 @@ def test_a_flight_begins(windows: dict[str, str], flight: Path, tmp_path: Path) 
     assert f'then kgcp check "{bare}"' in run.stderr
 
 
-def test_two_at_once_are_told(windows: dict[str, str], flight: Path, tmp_path: Path) -> None:
+def test_a_second_run_at_the_same_time_is_refused(
+    windows: dict[str, str], flight: Path, tmp_path: Path
+) -> None:
     holder = (
         "import sys, time\n"
         "from pathlib import Path\n"

@@ -30,7 +30,9 @@ def flight(unmeasured: SampleFlight) -> SampleFlight:
         ("[0, 180, 282, 317]", "0, 180, 282, 317 for A: these are its mirror image"),
     ],
 )
-def test_a_wrong_code_is_told_with_the_dots(flight: SampleFlight, code: str, words: str) -> None:
+def test_a_wrong_code_is_reported_with_the_dots_that_were_read(
+    flight: SampleFlight, code: str, words: str
+) -> None:
     flight.edit(("[0, 43, 78, 180]", code))
     sheet = flight.path / "sheet"
     result = flight.run("detect", *FAST, "--overlay", str(sheet))
@@ -68,7 +70,9 @@ def test_a_target_outside_the_frame_is_out_of_view(measured_sample: SampleFlight
     assert (table["status"] == "measured").sum() == len(FRAMES) - 1
 
 
-def test_quiet_runs_tell_it_too(flight: SampleFlight, tmp_path: Path) -> None:
+def test_a_quiet_run_without_a_measurement_reports_it_too(
+    flight: SampleFlight, tmp_path: Path
+) -> None:
     result = flight.run("detect", "--jobs", "0", "--quiet", "--min-radius", "200")
     assert result.exit_code == 1
     assert result.stderr.startswith("kgcp: error: no target was measured in any of 3 frames: ")

@@ -55,7 +55,7 @@ def damaged(draw: st.DrawFn, target: str) -> bytes:
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_damage_is_a_known_error(target: str, tmp_path: Path) -> None:
+def test_damaged_files_raise_only_known_errors(target: str, tmp_path: Path) -> None:
     @settings(max_examples=40, suppress_health_check=list(HealthCheck), derandomize=True)
     @given(
         data=st.one_of(damaged(target), damaged(target), damaged(target), st.binary(max_size=99))
@@ -67,11 +67,11 @@ def test_damage_is_a_known_error(target: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", KEPT, ids=lambda path: f"{path.parent.name}/{path.name}")
-def test_what_was_found_stays_repaired(path: Path) -> None:
+def test_files_that_once_crashed_a_reader_are_accepted_or_refused(path: Path) -> None:
     """A reader accepts a file, or refuses it in one line; any other exception fails."""
     feed_in_new_folder(path.parent.name, path.read_bytes())
 
 
-def test_the_seeds_are_small_and_none_is_without_a_target() -> None:
+def test_kept_files_are_small_and_cover_every_reader() -> None:
     assert sum(path.stat().st_size for path in KEPT) < 200_000
     assert {path.parent.name for path in KEPT} == set(TARGETS)

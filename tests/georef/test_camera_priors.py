@@ -104,7 +104,7 @@ def test_the_default_mount_lies_level_with_its_up_forward() -> None:
 
 
 @pytest.mark.parametrize("mount_deg", [0.0, 25.0, -140.0])
-def test_the_camera_is_where_it_was_and_looks_where_it_looked(mount_deg: float) -> None:
+def test_priors_have_the_true_position_and_attitude(mount_deg: float) -> None:
     settings = _settings(mount_deg=mount_deg)
     camera_map, map_from_camera, seen = _scene(settings)
     (prior,) = _priors(seen, _whereabouts(settings, _RPY, np.zeros(3)))
@@ -165,7 +165,7 @@ def test_covariance_is_that_of_the_scatter() -> None:
     assert 5.1 < np.mean(distances) < 7.0  # χ² of 6: mean 6 ± 0.28
 
 
-def test_opk_covariance_is_that_of_small_turns() -> None:
+def test_opk_covariance_is_that_of_small_rotations() -> None:
     turn_cov = np.diag([0.0, 0.0, 0.0, 1.0, 2.0, 3.0]) ** 2 * 1e-8
     rotation = rotation_from_opk(_OPK[None])[0] @ CAMERA_FROM_PHOTO
     prior = CameraPrior("f", np.zeros(3), rotation, turn_cov)
@@ -196,7 +196,7 @@ def test_common_errors_are_part_of_a_prior() -> None:
     np.testing.assert_allclose(both.cov, large.cov)
 
 
-def test_no_prior_without_a_pose_that_can_be_told_apart() -> None:
+def test_ambiguous_poses_give_no_prior() -> None:
     settings = _settings()
     _, _, seen = _scene(settings)
     target_positions = _whereabouts(settings, _RPY, np.zeros(3))

@@ -9,11 +9,13 @@ from kgcp.georef.crs_guess import projected_crs_near, utm_crs
     ("longitude", "latitude", "crs"),
     [(11.5, 48.1, "EPSG:32632"), (-180.0, -1.0, "EPSG:32701"), (180.0, 1.0, "EPSG:32601")],
 )
-def test_utm_zones(longitude: float, latitude: float, crs: str) -> None:
+def test_utm_zones_follow_from_longitude_and_latitude(
+    longitude: float, latitude: float, crs: str
+) -> None:
     assert utm_crs(longitude, latitude) == crs
 
 
-def test_systems_in_which_a_point_is_where_the_frames_were() -> None:
+def test_guessed_systems_are_those_that_place_a_point_near_the_frames() -> None:
     near = projected_crs_near(689_412.0, 5_336_208.0, 11.549, 48.151)
     assert near[0] == "EPSG:25832"
     assert "EPSG:32632" in near

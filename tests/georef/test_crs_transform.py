@@ -138,7 +138,7 @@ def test_feet_become_metres_by_the_legal_ratio_in_plan_and_height() -> None:
     np.testing.assert_allclose(above_sea.transform(*feet), feet * _US_FOOT_M, atol=1e-6)
 
 
-def test_no_way_is_better_than_a_second_best_one() -> None:
+def test_transformations_that_are_not_exact_are_refused() -> None:
     with pytest.raises(KgcpError) as caught:  # NAD83 and ETRS89 differ by more than a metre
         _change("EPSG:25831", "EPSG:2263", _UTM31)
     assert "crs 'EPSG:2263'" in str(caught.value)
@@ -170,7 +170,7 @@ def _drift_m(years: float) -> FloatArray:
     return np.array([moved @ east, moved[2] / math.cos(latitude)])
 
 
-def test_a_continent_drifts_until_the_day_of_the_trajectory() -> None:
+def test_continental_drift_is_applied_up_to_the_date_of_the_trajectory() -> None:
     east_m, north_m = _drift_m(2026.0 + 166.0 / 365.0 - 2020.0)
     assert math.hypot(east_m, north_m) > 0.3
     fixed = convert_positions("t.csv", _CANBERRA[None], "EPSG:7912", "EPSG:7843", _IN_2026_S)[0]
@@ -179,7 +179,7 @@ def test_a_continent_drifts_until_the_day_of_the_trajectory() -> None:
     assert metres[1] == pytest.approx(-north_m, abs=2e-3)
 
 
-def test_operations_are_those_of_the_place() -> None:
+def test_operations_of_other_countries_are_not_used() -> None:
     """EPSG:25832 is also Norway's, whose grids PROJ would take for best anywhere in Europe."""
     munich = np.array([[11.5, 48.1, 500.0]])
     fixed = convert_positions("t.csv", munich, "EPSG:9989", "EPSG:25832", _IN_2026_S)[0]
@@ -187,7 +187,7 @@ def test_operations_are_those_of_the_place() -> None:
     assert np.linalg.norm(drift) == pytest.approx(37.5 * 0.025, abs=0.15)  # years of 2.5 cm
 
 
-def test_points_on_another_map_are_those_of_their_day() -> None:
+def test_points_in_another_datum_are_those_of_their_date() -> None:
     source = LocalFrame.at("EPSG:7843", _CANBERRA)
     transform = CrsTransform.to("EPSG:7912", source, _CANBERRA, time_s=_IN_2026_S)
     there = transform.positions(_CANBERRA[None])
@@ -208,7 +208,7 @@ def test_wgs84_is_not_reached_without_a_date_where_it_matters() -> None:
         wgs84_from_map("EPSG:7910", [_CANBERRA], "geojson")  # ITRF2005
 
 
-def test_a_datum_that_is_reached_to_a_metre_is_told() -> None:
+def test_an_inaccurate_datum_transformation_causes_a_warning() -> None:
     place = np.array([5.387, 52.155, 50.0])  # Amersfoort, whose grid leads from ETRS89
     with pytest.warns(KgcpWarning, match=r"^t\.csv: .* is good to 1 m only, .* \[vehicle\] crs"):
         convert_positions("t.csv", place[None], "EPSG:4979", "EPSG:28992", _IN_2026_S)

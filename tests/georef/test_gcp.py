@@ -74,7 +74,7 @@ def test_covariance_is_given_along_the_maps_axes() -> None:
     np.testing.assert_allclose(gcps[0].cov_m2, 0.02**2 * np.eye(3), atol=1e-12)
 
 
-def test_frames_outside_and_second_plates_are_counted_not_lost() -> None:
+def test_frames_outside_and_second_plates_are_skipped_and_counted() -> None:
     sightings = [
         _sighting(1, "A", -5.0),
         _sighting(2, "A", 5.0),

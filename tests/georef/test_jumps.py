@@ -24,7 +24,7 @@ def test_false_flags_are_rare_whatever_the_stated_deviation() -> None:
         assert find_jumps(time_s, noise, np.full(4000, stated)).sum() <= 1
 
 
-def test_a_restless_flight_is_not_taken_to_pieces() -> None:
+def test_a_turbulent_flight_has_no_jumps() -> None:
     rng = np.random.default_rng(9)
     time_s = 1.5 * np.arange(300.0)
     gusty = 60.0 + 3.0 * rng.standard_normal(300)  # metres, where the deviations say centimetres
@@ -39,7 +39,7 @@ def test_a_turn_from_climb_to_descent_is_no_jump() -> None:
         assert not find_jumps(time_s, height, np.full(100, 0.02)).any()
 
 
-def test_neither_ends_nor_gaps_nor_the_lonely_are_judged() -> None:
+def test_ends_gaps_and_isolated_values_are_never_flagged() -> None:
     time_s = np.concatenate((np.arange(10.0), 100.0 + np.arange(10.0), [500.0]))
     value = np.zeros(21)
     value[[0, 9, 10, 19, 20]] = 5.0

@@ -105,7 +105,7 @@ def test_grads_and_another_prime_meridian_make_no_difference_to_lengths() -> Non
     assert north[1] == pytest.approx(math.radians(0.009) * meridian_radius_m, rel=1e-4)
 
 
-def test_the_vertical_turns_with_the_earth() -> None:
+def test_verticals_of_distant_points_differ_by_the_earth_s_curvature() -> None:
     turned = _UTM31.level_rotations(np.array([[0.0, 0.0, 0.0], [0.0, 10_000.0, 0.0]]))
     np.testing.assert_allclose(turned[0], np.eye(3), atol=1e-12)
     tilt = math.acos(turned[1][2, 2])

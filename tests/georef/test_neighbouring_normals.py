@@ -50,7 +50,7 @@ def plate(number: int, *, is_sure: bool, is_turned: bool = False) -> FrameResult
     return FrameResult(f"f{number:02d}.jpg", 100.0 + number, ExposureSettings(), (measurement,))
 
 
-def test_neighbours_turn_a_doubtful_normal_to_theirs_and_confirm_one_that_is() -> None:
+def test_neighbours_correct_or_confirm_an_ambiguous_normal() -> None:
     results = [plate(k, is_sure=k not in {4, 7}, is_turned=k == 7) for k in range(12)]
     preferences = preferences_of_neighbours(results)
     assert preferences.keys() == {("f04.jpg", "A", 0), ("f07.jpg", "A", 0)}
@@ -60,12 +60,12 @@ def test_neighbours_turn_a_doubtful_normal_to_theirs_and_confirm_one_that_is() -
 
 
 @pytest.mark.parametrize("sure", [range(0), range(5), (0, 1, 2, 3, 30, 31, 32)])
-def test_few_or_far_neighbours_say_nothing(sure: range | tuple[int, ...]) -> None:
+def test_too_few_or_distant_neighbours_give_no_preference(sure: range | tuple[int, ...]) -> None:
     doubtful = FrameResult("x", 116.0, ExposureSettings(), plate(9, is_sure=False).outcomes)
     assert preferences_of_neighbours([*(plate(k, is_sure=True) for k in sure), doubtful]) == {}
 
 
-def test_the_poses_change_places_with_all_that_follows_from_them() -> None:
+def test_exchanged_poses_exchange_all_values_that_follow_from_them() -> None:
     (before,) = plate(3, is_sure=False).outcomes
     assert isinstance(before, Measurement)
     assert before.alternative is not None

@@ -97,7 +97,7 @@ def test_a_face_lies_above_its_position(normal: tuple[float, float, float]) -> N
     assert np.array(normal) @ more @ normal == pytest.approx(0.0, abs=1e-9)
 
 
-def test_correlated_errors_of_a_pose_cancel(made: Path) -> None:
+def test_correlated_errors_of_a_pose_cancel_in_the_prediction(made: Path) -> None:
     """A turn about the target, as resections are unsure of, moves it little in the image."""
     flight = read_flight(made)
     data = FlightData(flight, ["f_0.png"])

@@ -29,7 +29,7 @@ def vehicle(time_offset_s: float = 0.0) -> Vehicle:
     return Vehicle.on(trajectory, settings, LocalFrame.at(CRS, ORIGIN))
 
 
-def test_a_level_plate_goes_by_poses_and_else_by_the_plumb() -> None:
+def test_the_normal_of_a_level_plate_follows_from_poses_or_from_the_plumb_camera() -> None:
     attitudes = CameraAttitudes(POSES, 4.0)
     a, c, b = normal_priors(["a", "c", "b"], [None] * 3, attitudes, None, 0.9)
     assert a is not None
@@ -47,14 +47,16 @@ def test_a_level_plate_goes_by_poses_and_else_by_the_plumb() -> None:
     assert exact.sd_deg == 0.9
 
 
-def test_nothing_is_known_of_a_plate_that_is_not_said_to_be_level() -> None:
+def test_a_plate_not_stated_to_be_level_has_no_prior() -> None:
     assert normal_priors(["a"], [4.0], CameraAttitudes(POSES, None), None, None) == [None]
     without_poses = CameraAttitudes(None, None)
     assert normal_priors(["a"], [4.0], without_poses, vehicle(), None) == [None]
 
 
 @pytest.mark.parametrize(("level_sd_deg", "mounted_sd_deg"), [(None, 3.0), (1.0, 1.0)])
-def test_a_plate_lies_as_its_vehicle(level_sd_deg: float | None, mounted_sd_deg: float) -> None:
+def test_a_plate_on_a_vehicle_has_the_normal_of_the_vehicle(
+    level_sd_deg: float | None, mounted_sd_deg: float
+) -> None:
     attitudes = CameraAttitudes(POSES, None)
     outside, inside = normal_priors(
         ["a", "b"], [40.0, 4.0], attitudes, vehicle(time_offset_s=1.0), level_sd_deg

@@ -56,7 +56,7 @@ def test_errors_between_neighbours_are_those_stated() -> None:
     assert np.mean(np.abs(np.array(z)) > 4.0) < 0.002
 
 
-def test_an_even_motion_is_known_to_the_floor() -> None:
+def test_a_uniform_motion_is_predicted_with_the_smallest_deviations() -> None:
     time_s = np.arange(10.0)
     state = np.column_stack((100.0 + 30.0 * time_s, 50.0 + 7.0 * time_s, np.full(10, 3.0)))
     (one,) = [e for e in predict_between(Track(time_s, without(state, np.array([4])))) if e]
@@ -65,7 +65,7 @@ def test_an_even_motion_is_known_to_the_floor() -> None:
     assert (one.sd_px, one.sd_log_radius) == pytest.approx((0.5, 0.02))
 
 
-def test_gaps_are_bridged_that_are_not_much_longer_than_what_tells_the_motion() -> None:
+def test_only_gaps_not_much_longer_than_the_known_intervals_are_bridged() -> None:
     time_s = np.arange(30.0)
     state = np.column_stack((30.0 * time_s, 7.0 * time_s, np.full(30, 3.0)))
     track = Track(time_s, without(state, np.array([4, 5, 6, *range(12, 20)])))
@@ -74,7 +74,7 @@ def test_gaps_are_bridged_that_are_not_much_longer_than_what_tells_the_motion() 
     assert sum(one is not None for one in predict_between(track)) == 11
 
 
-def test_a_wild_motion_is_not_sure() -> None:
+def test_predictions_of_an_erratic_motion_are_uncertain() -> None:
     rng = np.random.default_rng(2)
     time_s = np.arange(40.0)
     state = np.column_stack((rng.uniform(0, 1600, 40), rng.uniform(0, 1200, 40), np.full(40, 2.5)))
@@ -82,7 +82,7 @@ def test_a_wild_motion_is_not_sure() -> None:
     assert not any(each.is_sure for each in predictions if each is not None)
 
 
-def test_nothing_is_extrapolated_nor_made_of_few_frames() -> None:
+def test_there_is_no_extrapolation_and_no_prediction_from_few_frames() -> None:
     time_s = np.arange(8.0)
     state = np.column_stack((30.0 * time_s, time_s, np.full(8, 3.0)))
     ends = predict_between(Track(time_s, without(state, np.array([0, 7]))))
@@ -93,7 +93,7 @@ def test_nothing_is_extrapolated_nor_made_of_few_frames() -> None:
     assert predict_between(Track(timeless, without(state, np.array([4])))) == [None] * 8
 
 
-def test_a_reference_is_believed_as_far_as_it_has_proved_itself() -> None:
+def test_the_deviations_of_a_reference_are_its_errors_in_other_frames() -> None:
     rng = np.random.default_rng(8)
     truth = np.column_stack((rng.uniform(0, 1600, 90), rng.uniform(0, 1200, 90), np.full(90, 3.0)))
     predicted = truth + rng.normal(0.0, 1.0, truth.shape) * (3.0, 3.0, 0.04)
@@ -108,7 +108,7 @@ def test_a_reference_is_believed_as_far_as_it_has_proved_itself() -> None:
 
 
 @pytest.mark.parametrize(("found", "shift_px"), [(3, 0.0), (40, 60.0)])
-def test_a_reference_without_proof_or_far_off_says_nothing(found: int, shift_px: float) -> None:
+def test_an_untested_or_wrong_reference_predicts_nothing(found: int, shift_px: float) -> None:
     truth = np.column_stack((np.arange(50.0), np.arange(50.0), np.full(50, 3.0)))
     seen = without(truth, np.arange(found, 50))
     predictions = predict_by_reference(
@@ -127,7 +127,7 @@ def test_a_bias_of_the_reference_counts_as_its_deviation() -> None:
     assert prediction.sd_px == pytest.approx(12.0 / 1.177, rel=0.01)
 
 
-def test_the_surer_source_is_taken_and_found_frames_are_left() -> None:
+def test_the_more_certain_prediction_is_used_and_found_frames_get_none() -> None:
     time_s = np.arange(12.0)
     truth = np.column_stack((100.0 + 30.0 * time_s, 9.0 * time_s, np.full(12, 3.0)))
     track = Track(time_s, without(truth, np.array([5, 11])))

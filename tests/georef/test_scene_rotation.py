@@ -24,7 +24,7 @@ def turning(velocity_rad_s: FloatArray, wobble_rad: float = 0.0) -> tuple[FloatA
     return turns.apply([1.0, -2.0, 20.0]), turns.as_matrix()
 
 
-def test_an_even_rotation_is_found() -> None:
+def test_a_uniform_rotation_is_recovered() -> None:
     velocity = np.array([0.06, -0.03, 0.02])
     rotations = rotations_between_frames(TIME_S, *turning(velocity), A_PRIORI)
     for rotation in rotations[1:-1]:
@@ -33,7 +33,7 @@ def test_an_even_rotation_is_found() -> None:
     assert rotations[0] == rotations[-1] == A_PRIORI
 
 
-def test_frames_that_foretell_nothing_leave_what_was_known() -> None:
+def test_unpredictable_frames_leave_the_a_priori_rotation() -> None:
     rotations = rotations_between_frames(TIME_S, *turning(np.zeros(3), wobble_rad=0.5), A_PRIORI)
     for rotation in rotations[1:-1]:
         assert np.linalg.norm(rotation.velocity_rad_s) < A_PRIORI.sd_rad_s
@@ -48,20 +48,20 @@ def test_deviations_are_those_of_a_restless_camera() -> None:
     assert 0.3 < math.sqrt(np.mean(np.square(off))) < 1.3
 
 
-def test_few_frames_tell_nothing() -> None:
+def test_few_frames_leave_the_a_priori_rotation() -> None:
     sight, attitude = turning(np.array([0.1, 0.0, 0.0]))
     few = slice(0, 6)
     rotations = rotations_between_frames(TIME_S[few], sight[few], attitude[few], A_PRIORI)
     assert rotations == [A_PRIORI] * 6
 
 
-def test_two_sources_are_weighted() -> None:
+def test_two_sources_are_combined_by_their_weights() -> None:
     rotation = combine_with_prior(np.array([0.1, 0.0, -0.2]), A_PRIORI.sd_rad_s, A_PRIORI)
     assert rotation.velocity_rad_s == pytest.approx((0.05, 0.0, -0.1))
     assert rotation.sd_rad_s == pytest.approx(A_PRIORI.sd_rad_s / math.sqrt(2.0))
 
 
-def test_a_camera_s_shift_and_turn_are_found_between_its_poses() -> None:
+def test_velocity_and_rotation_of_a_camera_follow_from_its_poses() -> None:
     """In any order of the frames; without times, what is known before remains."""
     velocity_m_s, turn_rad_s = np.array([7.0, -2.0, 0.5]), np.array([0.03, -0.05, 0.02])
     enu_from_camera = Rotation.from_rotvec(TIME_S[:, None] * turn_rad_s).as_matrix()

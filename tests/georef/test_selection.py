@@ -90,7 +90,7 @@ def test_a_wrong_distance_and_a_wrong_height_are_flagged_by_name() -> None:
     assert kept[12].flag is Flag.DISTANCE
 
 
-def test_gates_hold_back_what_is_bad_and_what_is_not_known() -> None:
+def test_gates_reject_bad_and_unknown_values() -> None:
     good = _point(0, 0.0)
     tilted = np.diag([0.001, 0.001, 0.09**2])
     cases = [

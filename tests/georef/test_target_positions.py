@@ -180,7 +180,7 @@ def test_a_time_offset_moves_frames_onto_the_trajectory() -> None:
     )
 
 
-def test_no_overlap_is_one_line_with_both_intervals_and_the_offset() -> None:
+def test_times_without_overlap_are_a_one_line_error_with_both_intervals() -> None:
     settings = VehicleSettings(time_offset_s=2.5)
     target_positions = TargetPositions.of(_CRS, [Target(_RING)], _straight(0.0), settings)
     with pytest.raises(KgcpError) as caught:
@@ -191,7 +191,7 @@ def test_no_overlap_is_one_line_with_both_intervals_and_the_offset() -> None:
     assert "\n" not in message
 
 
-def test_what_cannot_be_placed_at_all_is_an_error_with_a_remedy() -> None:
+def test_a_target_without_any_position_is_an_error_with_a_remedy() -> None:
     with pytest.raises(KgcpError, match="no target has a position"):
         TargetPositions.of(_CRS, [Target(_RING)], None, VehicleSettings())
     target_positions = TargetPositions.of(_CRS, [Target(_RING)], _straight(0.0), _LEVER)

@@ -58,7 +58,7 @@ def test_a_turn_is_followed_between_samples(rate_hz: float, tolerance_m: float) 
     np.testing.assert_allclose(np.linalg.norm(states.velocity_m_s, axis=1), 10.0, atol=0.5)
 
 
-def test_noise_over_a_short_interval_makes_no_wave() -> None:
+def test_noise_over_a_short_interval_causes_no_oscillation() -> None:
     time_s = np.array([0.0, 0.1, 0.2, 0.201, 0.3, 0.4])
     position = np.column_stack((10.0 * time_s, np.zeros(6), [0.0, 0.0, 0.0, 0.01, 0.0, 0.0]))
     states = _motion(time_s, position).states(np.array([0.05, 0.25]))
@@ -79,7 +79,9 @@ def test_noise_over_a_short_interval_makes_no_wave() -> None:
         ),
     ],
 )
-def test_uneven_epochs_straighten_no_turn(time_s: FloatArray, tolerance_m: float) -> None:
+def test_unevenly_spaced_epochs_do_not_flatten_a_turn(
+    time_s: FloatArray, tolerance_m: float
+) -> None:
     """A straight chord is 0.62 m off at 1 Hz, and 0.13 m over 0.45 s."""
     wanted = np.linspace(time_s[0], time_s[-1], 1201)
     states = _motion(time_s, _circle(time_s)).states(wanted)
@@ -89,7 +91,7 @@ def test_uneven_epochs_straighten_no_turn(time_s: FloatArray, tolerance_m: float
 
 
 @pytest.mark.parametrize("rate_hz", [10.0, 100.0])
-def test_noise_beside_a_hole_is_not_amplified_over_it(rate_hz: float) -> None:
+def test_noise_beside_a_gap_is_not_amplified_in_the_gap(rate_hz: float) -> None:
     time_s = np.arange(0.0, 20.0, 1.0 / rate_hz)
     time_s = time_s[np.abs(time_s - 10.0) > 0.19]
     noise_m = np.random.default_rng(5).normal(0.0, 0.01, (len(time_s), 3))
@@ -116,7 +118,7 @@ def test_heading_takes_the_short_way_through_north() -> None:
     np.testing.assert_allclose(states.angular_velocity_rad_s[0], [0.0, 0.0, math.radians(30.0)])
 
 
-def test_what_lies_outside_or_in_a_gap_is_said_by_name() -> None:
+def test_times_outside_the_trajectory_or_in_a_gap_are_named() -> None:
     time_s = np.concatenate((np.arange(0.0, 1.0, 0.1), np.arange(3.0, 4.0, 0.1)))
     motion = _motion(time_s, _circle(time_s))
     asked = np.array([-0.1, 0.0, 0.55, 0.9, 2.0, 3.0, time_s[-1], 4.5])

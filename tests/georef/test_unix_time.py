@@ -23,7 +23,7 @@ class WindowsDatetime(datetime):
         return super().fromtimestamp(timestamp, tz)
 
 
-def test_times_that_count_from_the_start_of_a_flight_have_dates(
+def test_times_counted_from_the_start_of_a_flight_are_converted_to_dates(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for module in ("georef.gps_counts", "georef.unix_time", "quality.checks.clock"):

@@ -146,7 +146,7 @@ def test_compression_of_large_rings_is_not_taken_for_uneven_light() -> None:
 
 
 @pytest.mark.parametrize("response", [Response.LINEAR, Response.SRGB])
-def test_the_light_on_a_large_ring_half_in_shade_can_be_shown(response: Response) -> None:
+def test_the_fitted_light_on_a_large_ring_half_in_shade_can_be_shown(response: Response) -> None:
     shot = half_in_shade(response, 0.4, np.random.default_rng(11))
     left = residual_image_of(shot.grey, shot.camera, TARGET_PLATE.target, shot.pose, shot.psf_px)
     assert left.white is not None
@@ -155,7 +155,7 @@ def test_the_light_on_a_large_ring_half_in_shade_can_be_shown(response: Response
 
 
 @pytest.mark.parametrize("count", [2, 3, 7])
-def test_bins_have_a_camera_of_their_own(count: int) -> None:
+def test_the_binned_camera_has_bins_as_pixels(count: int) -> None:
     points = np.array([[0.1, -0.2, 1.0], [-0.3, 0.15, 1.1]])
     seen, bins = CAMERA.project(points), CAMERA.binned(count).project(points)
     np.testing.assert_allclose(count * bins + 0.5 * (count - 1), seen, atol=1e-9)
@@ -163,7 +163,7 @@ def test_bins_have_a_camera_of_their_own(count: int) -> None:
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("count", [2, 3])
-def test_bins_are_means_and_know_which_share_is_clipped(count: int, dtype: type) -> None:
+def test_bins_are_means_with_their_clipped_share(count: int, dtype: type) -> None:
     full = np.iinfo(dtype).max
     frame = np.random.default_rng(4).integers(0, full, (610, 753), dtype)
     frame[frame > 0.7 * full] = full

@@ -83,7 +83,7 @@ def test_burnt_white_in_full_light_is_not_masked(
         (Response.UNKNOWN, ToneCurve.SRGB),
     ],
 )
-def test_displaced_edges_are_those_of_the_light_that_falls_on_them(
+def test_the_edge_shift_follows_the_light_on_each_edge(
     photograph: Callable[..., GreyArray],
     start_near: Callable[..., InitialPose],
     response: Response,

@@ -38,7 +38,7 @@ def miss(frame: GreyArray, camera: Camera, target: Target) -> Miss:
     return outcome
 
 
-def test_a_ring_below_the_smallest_radius_is_too_small(
+def test_a_ring_below_the_smallest_radius_is_reported_as_too_small(
     bare: Target, camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
 ) -> None:
     pose = place_plate((240.0, 180.0), 5.2, turn_deg=30.0)
@@ -48,7 +48,7 @@ def test_a_ring_below_the_smallest_radius_is_too_small(
     assert found.candidates == 1
 
 
-def test_a_ring_whose_dots_have_gone_is_too_blurred(
+def test_a_ring_with_blurred_away_dots_is_reported_as_too_blurred(
     bare: Target, camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
 ) -> None:
     pose = place_plate((240.0, 180.0), 14.0, turn_deg=30.0)
@@ -56,7 +56,7 @@ def test_a_ring_whose_dots_have_gone_is_too_blurred(
     assert found.reason is Reason.TOO_BLURRED
 
 
-def test_a_covered_ring_is_hidden(
+def test_a_covered_ring_is_reported_as_hidden(
     bare: Target, camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
 ) -> None:
     frame = draw_frame((bare, place_plate((240.0, 180.0), 40.0, turn_deg=30.0))).copy()
@@ -68,7 +68,7 @@ def test_a_covered_ring_is_hidden(
     assert "of its edge not seen" in found.detail
 
 
-def test_another_code_is_named_with_its_numbers(
+def test_another_code_is_reported_with_its_numbers(
     bare: Target, camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
 ) -> None:
     frame = draw_frame((plate_b(), place_plate((240.0, 180.0), 30.0, turn_deg=30.0)))
@@ -77,7 +77,7 @@ def test_another_code_is_named_with_its_numbers(
     assert "a dot is off by" in found.detail
 
 
-def test_the_ring_of_a_measured_target_explains_no_other_s_miss(
+def test_the_ring_of_a_measured_target_does_not_explain_another_target_s_miss(
     bare: Target, camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
 ) -> None:
     plates = [(bare, place_plate((140.0, 180.0), 40.0))]
@@ -93,7 +93,7 @@ def test_the_ring_of_a_measured_target_explains_no_other_s_miss(
     assert "ring at (340, 180)" in missed.detail
 
 
-def test_all_that_was_considered_is_kept(
+def test_all_examined_rings_are_kept(
     bare: Target, camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
 ) -> None:
     plates = [
@@ -108,7 +108,7 @@ def test_all_that_was_considered_is_kept(
     }
 
 
-def test_a_code_that_chance_explains_is_refused(
+def test_a_code_that_may_be_due_to_chance_is_refused(
     bare: Target, camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
 ) -> None:
     frame = draw_frame((bare, place_plate((240.0, 180.0), 9.0, turn_deg=30.0)))

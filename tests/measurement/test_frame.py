@@ -39,7 +39,7 @@ def measured(frame: GreyArray, camera: Camera, target: Target) -> list[Measureme
     [(9.0, 0.1, 1.0), (13.0, 0.06, 0.5), (30.0, 0.04, 0.15), (100.0, 0.04, 0.1)],
 )
 @pytest.mark.parametrize("turn_deg", [10.0, 200.0])
-def test_distance_and_centre_are_the_plate_s(
+def test_distance_and_centre_of_the_plate_are_right(
     target: Target,
     camera: Camera,
     place_plate: PlacePlate,
@@ -62,7 +62,7 @@ def test_distance_and_centre_are_the_plate_s(
 
 
 @pytest.mark.parametrize("way_deg", [0.0, 75.0, 160.0, 290.0])
-def test_a_large_ring_tells_its_two_poses_apart(
+def test_the_image_of_a_large_ring_decides_between_its_two_poses(
     target: Target, camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame, way_deg: float
 ) -> None:
     pose = place_plate((260.0, 170.0), 90.0, tilt_deg=25.0, way_deg=way_deg, turn_deg=40.0)
@@ -161,7 +161,7 @@ def test_each_target_has_its_own_outcome_in_order(
     assert missed == Miss("B", Reason.NO_CANDIDATE), "the only ring is that of A"
 
 
-def test_the_replica_serves_where_the_frame_cuts_the_ring(
+def test_the_replica_is_used_if_the_frame_cuts_the_ring(
     target: Target, camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
 ) -> None:
     pose = place_plate((240.0, 40.0), 90.0, turn_deg=35.0)
@@ -186,7 +186,7 @@ def test_the_replica_on_another_plate_is_not_this_target(
 
 
 @pytest.mark.parametrize("method", Method)
-def test_a_frame_is_not_kept_by_what_was_refused_in_it(
+def test_rejections_do_not_keep_the_frame_in_memory(
     method: Method,
     target: Target,
     camera: Camera,

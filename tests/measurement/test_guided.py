@@ -41,7 +41,7 @@ def look(
     [(5.0, {"ground": 0.75}), (14.0, {"black": 0.28, "white": 0.31, "noise": 0.002})],
     ids=["tiny", "faint"],
 )
-def test_what_was_missed_is_found_where_it_must_be(
+def test_a_missed_target_is_found_at_its_predicted_place(
     target: Target,
     camera: Camera,
     place_plate: PlacePlate,
@@ -60,7 +60,7 @@ def test_what_was_missed_is_found_where_it_must_be(
     assert seen.pose.distance_m == pytest.approx(pose.distance_m, rel=0.02)
 
 
-def test_a_score_may_be_lower_by_some_hundredths_where_a_target_must_be(
+def test_the_score_may_be_slightly_lower_at_a_predicted_place(
     target: Target,
     camera: Camera,
     place_plate: PlacePlate,
@@ -90,7 +90,7 @@ def test_a_score_may_be_lower_by_some_hundredths_where_a_target_must_be(
     ],
     ids=["elsewhere", "too small", "too large"],
 )
-def test_what_does_not_agree_is_refused(
+def test_a_target_away_from_its_prediction_is_refused(
     target: Target,
     camera: Camera,
     place_plate: PlacePlate,
@@ -113,7 +113,7 @@ def test_the_rest_of_the_frame_does_not_matter(
     assert np.linalg.norm(seen.centre_px - (200.0, 150.0)) < 0.5
 
 
-def test_decoys_where_the_target_must_be_are_not_taken_for_it(
+def test_decoys_at_the_predicted_place_are_refused(
     target: Target, camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
 ) -> None:
     """Plates of the same geometry with another code, small, tilted and noisy."""
@@ -152,7 +152,7 @@ def test_noise_and_edges_are_not_taken_for_a_target(target: Target, camera: Came
     assert taken == 0
 
 
-def test_another_target_s_plate_is_not_looked_at(
+def test_plates_of_other_targets_are_not_examined(
     target: Target, camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
 ) -> None:
     grey = draw_frame((target, place_plate((200.0, 150.0), 12.0)))
@@ -165,7 +165,7 @@ def test_another_target_s_plate_is_not_looked_at(
     )
 
 
-def test_what_was_considered_says_why_it_was_dropped(
+def test_examined_rings_have_the_reason_of_their_rejection(
     target: Target, camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
 ) -> None:
     decoy = Target(Ring("B", 0.9, 0.45, 0.642857143, 0.128571429, OTHER_CODES[0]))
@@ -187,7 +187,7 @@ def test_what_was_considered_says_why_it_was_dropped(
         (expected_at(200.0, 150.0, 12.0, sd_log_radius=0.5), True, False),
     ],
 )
-def test_only_what_is_known_well_and_can_be_seen_is_looked_for(
+def test_visible_and_certain_predictions_are_recognised(
     camera: Camera, expectation: Prediction, *, is_visible: bool, is_sure: bool
 ) -> None:
     assert (expectation.is_visible(camera), expectation.is_sure) == (is_visible, is_sure)

@@ -140,7 +140,7 @@ def test_the_shadow_of_a_mast_costs_little(
     check(outcomes, sigmas=6.0, percent=0.3)
 
 
-def test_a_broad_shadow_is_refused_or_costs_what_it_says(
+def test_a_broad_shadow_is_refused_or_covered_by_the_deviations(
     measure: Callable[..., list[Outcome]],
 ) -> None:
     """Where it lies along an edge of the ring, up to seven deviations and 0.7 % have been seen."""
@@ -159,7 +159,7 @@ def test_a_small_patch_over_the_edge_costs_little(
 
 
 @pytest.mark.parametrize("angle_deg", NO_CODE_THERE_DEG)
-def test_a_large_patch_over_the_edge_is_in_the_deviations(
+def test_deviations_cover_a_large_patch_over_the_edge(
     measure: Callable[..., list[Outcome]], angle_deg: float
 ) -> None:
     """A fifth of the outline: the fit leans towards the hole, and its deviation says so."""
@@ -168,7 +168,7 @@ def test_a_large_patch_over_the_edge_is_in_the_deviations(
 
 
 @pytest.mark.parametrize("quarter", [(1.0, 1.0), (-1.0, -1.0)])
-def test_a_hidden_quarter_is_refused_or_in_the_deviations(
+def test_a_hidden_quarter_is_refused_or_covered_by_the_deviations(
     measure: Callable[..., list[Outcome]], quarter: tuple[float, float]
 ) -> None:
     patch = rectangle((0.3 * quarter[0], 0.3 * quarter[1]), 0.6, 0.6), 0.35
@@ -197,7 +197,7 @@ def test_a_target_with_a_hidden_quarter_is_found_and_measured(
     assert seen.uncertainty.sd_distance_m < 1e-3 * pose.distance_m
 
 
-def test_a_replica_leads_to_its_ring_of_which_a_quarter_is_hidden(photograph: Photograph) -> None:
+def test_a_replica_leads_to_a_ring_with_a_hidden_quarter(photograph: Photograph) -> None:
     rng = np.random.default_rng(8)
     far, target = some_pose(rng), TARGET_PLATE.target
     pose = Pose(far.rotation, RADIUS_PX / 60.0 * far.translation_m)

@@ -75,7 +75,7 @@ def looked(
 
 
 @pytest.mark.parametrize("target", [DISC, RING], ids=["disc", "ring"])
-def test_true_centre_within_its_deviations(target: PlainTarget) -> None:
+def test_the_centre_is_right_within_its_deviations(target: PlainTarget) -> None:
     pose = pose_at(90.4, 71.7, target)
     outcome = looked(frame_with((target, pose)), prediction_of(pose, (5.0, -4.0)), target)
     assert isinstance(outcome, Measurement)
@@ -92,7 +92,7 @@ def test_true_centre_within_its_deviations(target: PlainTarget) -> None:
 
 
 @pytest.mark.parametrize("target", [DISC, RING], ids=["disc", "ring"])
-def test_without_a_border_the_texture_of_the_ground_is_allowed_for(target: PlainTarget) -> None:
+def test_without_a_border_deviations_cover_the_texture_of_the_ground(target: PlainTarget) -> None:
     """On the same grass, a border that is not there would be taken for even ground."""
     bare, rng = replace(target, border_m=None), np.random.default_rng(4)
     grass = cv2.GaussianBlur(rng.standard_normal((CAMERA.height, CAMERA.width)), (0, 0), 1.0)
@@ -139,7 +139,7 @@ def test_a_far_ring_is_measured_as_a_whole() -> None:
 
 
 @pytest.mark.parametrize(("radius_px", "least", "most"), [(5.0, 0.0005, 0.006), (3.0, 0.015, 0.06)])
-def test_an_unknown_tone_curve_leaves_the_size_of_a_far_ring(
+def test_an_unknown_tone_curve_does_not_change_the_size_of_a_far_ring(
     radius_px: float, least: float, most: float
 ) -> None:
     """Its two edges tell how far ink spreads; 1.5 px apart they do not, and it counts in full."""
@@ -161,14 +161,16 @@ def test_an_unknown_tone_curve_leaves_the_size_of_a_far_ring(
 @pytest.mark.parametrize(
     ("off_px", "size"), [((25.0, 0.0), 1.0), ((0.0, 0.0), 1.2), ((0.0, 0.0), 0.8)]
 )
-def test_refuses_another_place_or_size(off_px: tuple[float, float], size: float) -> None:
+def test_a_disc_of_another_place_or_size_is_refused(
+    off_px: tuple[float, float], size: float
+) -> None:
     pose = pose_at(90.4, 71.7)
     outcome = looked(frame_with((DISC, pose)), prediction_of(pose, off_px, size))
     assert isinstance(outcome, Miss)
     assert outcome.reason in {Reason.UNLIKE_PREDICTION, Reason.NO_CANDIDATE}
 
 
-def test_refuses_the_other_polarity_and_another_shape() -> None:
+def test_another_polarity_or_shape_is_refused() -> None:
     pose = pose_at(90.4, 71.7)
     grey = frame_with((DISC, pose))
     for other in (
@@ -189,7 +191,7 @@ def pose_tilted(pose: Pose) -> Pose:
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 20.0, 40.0, 55.0])
 @pytest.mark.parametrize("target", [DISC, RING], ids=["disc", "ring"])
-def test_a_free_normal_leaves_two_centres(target: PlainTarget, tilt_deg: float) -> None:
+def test_a_free_normal_allows_two_centres(target: PlainTarget, tilt_deg: float) -> None:
     """The place is their mean: it is off by half of what they differ by, and says so.
 
     Circles that are each measured by themselves tell which of the two it is.
@@ -225,7 +227,7 @@ def test_a_free_normal_leaves_two_centres(target: PlainTarget, tilt_deg: float) 
         assert max(float(each @ pose.normal) for each in normals) > math.cos(math.radians(1.5))
 
 
-def test_a_free_normal_asks_for_a_size_and_some_width() -> None:
+def test_with_a_free_normal_size_and_least_width_are_tested() -> None:
     target = replace(DISC, normal_enu=None)
     for size, tilt_rad in ((1.2, 0.3), (0.8, 0.3), (1.0, 1.2)):
         pose = pose_towards(
@@ -237,7 +239,7 @@ def test_a_free_normal_asks_for_a_size_and_some_width() -> None:
 
 
 @pytest.mark.parametrize("uneven_px", [0.0, 0.35])
-def test_refuses_a_stone_of_the_right_size(uneven_px: float) -> None:
+def test_a_stone_of_the_right_size_is_refused(uneven_px: float) -> None:
     radius_px = 4.5
     sight_m = RADIUS_PX / radius_px * pose_at(90.0, 70.0).translation_m
     pose = pose_towards(sight_m, np.array([0.0, 0.0, 1.0]))
@@ -256,7 +258,7 @@ def test_refuses_a_stone_of_the_right_size(uneven_px: float) -> None:
         assert "uneven edge" in outcome.detail
 
 
-def test_two_alike_are_ambiguous() -> None:
+def test_two_equal_targets_are_ambiguous() -> None:
     small = replace(DISC, border_m=None)
     pose = pose_at(80.0, 70.0)
     grey = frame_with((small, pose), (small, pose_at(110.0, 70.0)))
@@ -306,7 +308,7 @@ def test_the_smallest_disc_needs_even_ground_and_a_normal(
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 50.0])
 @pytest.mark.parametrize("share", [0.3, 0.42, 0.58, 0.9])
-def test_refuses_a_smooth_blob(share: float, tilt_deg: float) -> None:
+def test_a_smooth_blob_is_refused(share: float, tilt_deg: float) -> None:
     """Spread by so much of the smaller semi-axis, which a tilt shortens: half is the limit."""
     radius_px, tilt_rad = 4.5, math.radians(tilt_deg)
     along = RADIUS_PX / radius_px * pose_at(90.0, 70.0).translation_m
@@ -327,7 +329,7 @@ def test_refuses_a_smooth_blob(share: float, tilt_deg: float) -> None:
         assert outcome.reason is Reason.TOO_BLURRED
 
 
-def test_fit_returns_what_was_projected() -> None:
+def test_the_fit_recovers_the_projected_circles() -> None:
     pose = pose_at(150.0, 30.0, RING)
     radii = np.array(RING.radii_m)
     moments = circle_images(CAMERA, circles_about(pose, radii)).moments
@@ -377,7 +379,7 @@ def read_row_by_row(pose: Pose, radius_m: float, rate_rad_s: FloatArray) -> Floa
 
 
 @pytest.mark.parametrize("target", [DISC, RING], ids=["disc", "ring"])
-def test_motion_under_a_rolling_shutter_is_in_the_deviations(target: PlainTarget) -> None:
+def test_deviations_cover_unknown_motion_under_a_rolling_shutter(target: PlainTarget) -> None:
     """Forty of R 20 px: twice as near as others here."""
     rng, radii = np.random.default_rng(6), np.array(target.radii_m)
     cov = 1e-5 * np.diag([1.0, 1.0, 100.0, 100.0, 100.0])
@@ -400,7 +402,7 @@ def test_motion_under_a_rolling_shutter_is_in_the_deviations(target: PlainTarget
     assert z_still > 10.0
 
 
-def test_motion_that_is_known_is_taken_off() -> None:
+def test_known_motion_is_corrected() -> None:
     rng, radii = np.random.default_rng(8), np.array(RING.radii_m)
     cov = 1e-5 * np.diag([1.0, 1.0, 100.0, 100.0, 100.0])
     percent, z = [], []
@@ -423,7 +425,7 @@ def test_motion_that_is_known_is_taken_off() -> None:
     assert 0.7 < float(np.sqrt(np.mean(np.square(z)))) < 1.4
 
 
-def test_a_rolling_shutter_widens_what_is_reported() -> None:
+def test_a_rolling_shutter_enlarges_the_reported_deviations() -> None:
     pose = pose_at(90.4, 71.7)
     grey, prediction = frame_with((DISC, pose)), prediction_of(pose)
     still = measure_plain(grey, CAMERA, DISC, prediction)

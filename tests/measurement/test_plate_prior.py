@@ -75,7 +75,7 @@ def is_right(seen: Measurement, truth: Pose) -> bool:
     return angle_deg(seen.pose, truth) < angle_deg(other_pose(seen).pose, truth)
 
 
-def test_the_prior_finds_the_right_side_where_the_image_cannot() -> None:
+def test_the_prior_chooses_the_right_pose_if_the_image_cannot() -> None:
     by_image = [other_pose(frame(i)[2]).ambiguity for i in range(FRAMES)]
     assert np.median(by_image) < 4.0, "the image alone is not sure"
     corrected = [measure(frame(i)[1], PRIOR) for i in range(FRAMES)]
@@ -104,7 +104,7 @@ def test_a_confirmed_choice_keeps_every_value() -> None:
     assert other_pose(after).ambiguity > other_pose(before).ambiguity
 
 
-def test_a_confirmed_choice_is_surer_by_what_the_other_pose_added() -> None:
+def test_confirming_a_pose_removes_the_covariance_of_the_other_pose() -> None:
     """The chance that it is the right one, times the square of how far it is off."""
     _, grey, before = frame(0)
     after = measure(grey, NormalPrior(before.pose.normal, SD_DEG))
@@ -119,7 +119,7 @@ def test_a_confirmed_choice_is_surer_by_what_the_other_pose_added() -> None:
     np.testing.assert_allclose(less, expected, rtol=0.0, atol=1e-3 * np.abs(expected).max())
 
 
-def test_a_vague_prior_says_nothing() -> None:
+def test_a_vague_prior_does_not_decide() -> None:
     _, grey, before = frame(0)
     after = measure(grey, NormalPrior(DOWN, 5000.0))
     assert np.array_equal(after.pose.rotation, before.pose.rotation)

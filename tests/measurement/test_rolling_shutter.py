@@ -71,16 +71,14 @@ def standardised(pose: Pose, seen: Measurement) -> float:
     return (seen.pose.distance_m - pose.distance_m) / seen.uncertainty.sd_distance_m
 
 
-def test_motion_that_is_not_known_is_in_the_sigma(
-    photograph: Photograph, start_near: StartNear
-) -> None:
+def test_deviations_cover_unknown_motion(photograph: Photograph, start_near: StartNear) -> None:
     both = [measured(photograph, start_near, seed, is_known=False) for seed in range(FRAMES)]
     percent = [100.0 * abs(seen.pose.distance_m / pose.distance_m - 1.0) for pose, seen in both]
     assert max(percent) > 0.05
     assert 0.3 < math.sqrt(np.mean([standardised(*each) ** 2 for each in both])) < 1.6
 
 
-def test_motion_that_is_known_is_corrected(photograph: Photograph, start_near: StartNear) -> None:
+def test_known_motion_is_corrected(photograph: Photograph, start_near: StartNear) -> None:
     both = [measured(photograph, start_near, seed, is_known=True) for seed in range(FRAMES)]
     percent = [100.0 * abs(seen.pose.distance_m / pose.distance_m - 1.0) for pose, seen in both]
     assert max(percent) < 0.02

@@ -66,7 +66,7 @@ def changes(name: str, pose: Pose) -> tuple[FloatArray, FloatArray]:
 
 @pytest.mark.parametrize("pose", POSES)
 @pytest.mark.parametrize("name", CALIBRATION_PARAMETERS)
-def test_the_pose_follows_every_parameter(name: str, pose: Pose) -> None:
+def test_derivatives_of_the_pose_by_every_parameter_are_right(name: str, pose: Pose) -> None:
     column = CALIBRATION_PARAMETERS.index(name)
     follows = pose_by_calibration(CAMERA, RADIUS_M, pose)[:, column]
     by_centre, by_normal = changes(name, pose)
@@ -131,7 +131,7 @@ def test_a_wrong_diameter_moves_the_target_along_its_ray() -> None:
     assert np.allclose(common.pose_cov[3:], 0.0)
 
 
-def test_both_add_up_and_nothing_said_is_not_known() -> None:
+def test_both_effects_add_up_and_are_none_if_nothing_is_stated() -> None:
     pose = POSES[2]
     cov = CalibrationCovariance.of(("fx", "fy"), np.diag([1.0, 1.0]))
     ring = replace(RING, sd_outer_diameter_m=0.0005)

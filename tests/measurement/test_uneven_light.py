@@ -83,7 +83,7 @@ def measured(
 @pytest.mark.parametrize(
     ("lights", "percent"), [(shadow_edge, 0.06), (highlight, 0.03), (dirt, 0.03)]
 )
-def test_distances_in_uneven_light_are_right_and_as_uncertain_as_said(
+def test_distances_in_uneven_light_are_as_accurate_as_stated(
     photograph: Photograph, start_near: StartNear, lights: Lights, percent: float
 ) -> None:
     errors, sigmas = [], []
@@ -98,7 +98,7 @@ def test_distances_in_uneven_light_are_right_and_as_uncertain_as_said(
 
 
 @pytest.mark.parametrize("lights", [highlight, dirt])
-def test_a_frame_upside_down_gives_the_same(
+def test_a_frame_turned_upside_down_gives_the_same_result(
     photograph: Photograph, start_near: StartNear, lights: Lights
 ) -> None:
     """Knots that hung on the window's corner made differences of 0.5 to 1.1 σ (RMS)."""
@@ -127,7 +127,7 @@ def test_a_frame_upside_down_gives_the_same(
 
 
 @pytest.mark.parametrize("gain", [0.65, 1.8], ids=["seen", "burnt"])
-def test_an_antenna_s_sharp_shadow_is_understood_by_its_edges(
+def test_an_antenna_s_sharp_shadow_is_modelled_by_its_edges(
     photograph: Photograph, start_near: StartNear, gain: float
 ) -> None:
     """Levels on grids are smooth: with them alone rings are up to 0.1 % off, burnt ones 0.36 %."""
@@ -149,7 +149,7 @@ def test_an_antenna_s_sharp_shadow_is_understood_by_its_edges(
 
 
 @pytest.mark.parametrize(("lights", "percent"), [(shadow_edge, 2.5), (highlight, 0.8), (dirt, 0.7)])
-def test_small_rings_in_uneven_light_are_right_and_as_uncertain_as_said(
+def test_small_rings_in_uneven_light_are_as_accurate_as_stated(
     photograph: Photograph, start_near: StartNear, lights: Lights, percent: float
 ) -> None:
     """Taken for even, shades and highlights put rings of 9 px off by 1 to 6 %, or 3 to 15 σ."""
@@ -170,7 +170,7 @@ def test_small_rings_in_uneven_light_are_right_and_as_uncertain_as_said(
     assert 0.3 < math.sqrt(np.mean(np.square(sigmas))) < 1.7
 
 
-def test_dirt_under_a_film_curve_that_is_not_known_is_no_other_size(
+def test_dirt_under_an_unknown_film_curve_does_not_change_the_size(
     photograph: Photograph, start_near: StartNear
 ) -> None:
     """A light that the plain fit curved stayed so beneath varying levels: errors of 2 to 4 σ."""
@@ -200,7 +200,7 @@ def fits(monkeypatch: pytest.MonkeyPatch) -> list[TargetFit]:
 
 
 @pytest.mark.parametrize("lights", [highlight, dirt])
-def test_where_a_fit_with_levels_starts_does_not_matter(
+def test_fits_with_levels_do_not_depend_on_their_start(
     photograph: Photograph,
     start_near: StartNear,
     fits: list[TargetFit],
@@ -292,7 +292,7 @@ def errors_by_phone(
     return math.sqrt(np.mean(np.square(errors))), math.sqrt(np.mean(np.square(sigmas)))
 
 
-def test_a_phones_halos_are_told_from_levels(start_near: StartNear) -> None:
+def test_halos_of_a_phone_are_not_absorbed_by_levels(start_near: StartNear) -> None:
     """Without the pixels just beside edges, the RMS error of these plates was 0.0116 %."""
     percent, sigmas = errors_by_phone(start_near, Phone())
     assert 0.003 < percent < 0.0095
@@ -309,7 +309,7 @@ def test_edges_that_a_phone_makes_steeper_have_a_tone_of_their_own(
     assert 0.35 < sigmas < 1.5
 
 
-def test_white_that_a_phone_burns_and_darkens_is_taken_for_clipped(
+def test_burnt_white_that_a_phone_darkened_counts_as_clipped(
     start_near: StartNear,
 ) -> None:
     """Taken for what it seems, the RMS error of these plates was 0.0115 %."""
@@ -318,7 +318,7 @@ def test_white_that_a_phone_burns_and_darkens_is_taken_for_clipped(
     assert 0.35 < sigmas < 1.7
 
 
-def test_edges_beside_burnt_white_seem_displaced_by_the_white_that_is_seen(
+def test_the_edge_shift_beside_burnt_white_uses_the_visible_white(
     start_near: StartNear,
 ) -> None:
     """By the limit above which all counts as clipped, it would be 0.7 px."""
@@ -345,7 +345,7 @@ def test_edges_beside_burnt_white_seem_displaced_by_the_white_that_is_seen(
     assert np.nanmean(residuals == 0.0) > 0.3  # of clipped white, which explains itself
 
 
-def test_the_centre_is_uncertain_where_a_phone_hides_that_the_lens_is_skew(
+def test_the_centre_is_less_certain_if_processing_hides_a_skew(
     start_near: StartNear,
 ) -> None:
     """With no more of the skew's displacement than elsewhere, z of these centres was 2.0."""
@@ -388,7 +388,7 @@ def test_pixels_beside_edges_tie_the_levels_of_large_rings_together(
 
 
 @pytest.mark.parametrize("seed", [39, 41])
-def test_dirt_on_a_small_ring_is_told_by_its_edges(
+def test_dirt_on_a_small_ring_is_recognised_by_residuals_along_edges(
     photograph: Photograph, start_near: StartNear, monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
     """Cells of 8 px say too little there, and the light was taken for even: 0.25 % off."""
@@ -406,7 +406,7 @@ def test_dirt_on_a_small_ring_is_told_by_its_edges(
     assert by_cells.distance_m / pose.distance_m - 1.0 > 1e-3
 
 
-def test_light_that_is_not_explained_makes_what_another_start_finds_part_of_the_deviation(
+def test_unexplained_light_adds_the_difference_of_another_start(
     photograph: Photograph, start_near: StartNear, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = np.random.default_rng(12)
@@ -428,7 +428,7 @@ def test_light_that_is_not_explained_makes_what_another_start_finds_part_of_the_
 
 
 @pytest.mark.parametrize(("inflation", "is_repeated"), [(7.0, False), (9.0, True)])
-def test_only_light_that_is_hardly_explained_is_fitted_from_another_start(
+def test_only_poorly_explained_light_is_fitted_from_another_start(
     photograph: Photograph,
     start_near: StartNear,
     monkeypatch: pytest.MonkeyPatch,
@@ -468,7 +468,7 @@ def resting_at(pose: Pose) -> Callable[..., TargetFit]:
     return fit
 
 
-def test_a_comatic_lens_displaces_the_centre_by_as_little_as_said(
+def test_centres_with_a_comatic_lens_are_as_accurate_as_stated(
     photograph: Photograph, start_near: StartNear
 ) -> None:
     rng, squares = np.random.default_rng(8), []
@@ -513,7 +513,7 @@ def errors_out_of_focus(
     ("radius_px", "tone", "most_percent"),
     [(18.0, ToneCurve.LINEAR, 0.02), (12.0, ToneCurve.LINEAR, 0.06), (18.0, ToneCurve.SRGB, 0.03)],
 )
-def test_distances_out_of_focus_are_right_and_as_uncertain_as_said(
+def test_distances_out_of_focus_are_as_accurate_as_stated(
     photograph: Photograph,
     start_near: StartNear,
     radius_px: float,
@@ -526,7 +526,7 @@ def test_distances_out_of_focus_are_right_and_as_uncertain_as_said(
     assert 0.2 < math.sqrt(np.mean(sigmas**2)) < 1.5
 
 
-def test_defocus_is_seen_under_a_shadow(
+def test_defocus_is_recognised_under_a_shadow(
     photograph: Photograph, start_near: StartNear, fits: list[TargetFit]
 ) -> None:
     linear = ToneCurve.LINEAR
@@ -538,7 +538,7 @@ def test_defocus_is_seen_under_a_shadow(
     assert 0.3 < math.sqrt(np.mean(sigmas**2)) < 1.5
 
 
-def test_in_even_light_nothing_changes(
+def test_even_light_gives_the_result_of_the_plain_model(
     photograph: Photograph, start_near: StartNear, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The plain model's result is the result, to the last bit."""
@@ -645,7 +645,7 @@ def test_small_plates_half_in_shade_are_found_in_linear_images(
     assert found >= least
 
 
-def test_the_light_that_was_fitted_can_be_seen(photograph: Photograph) -> None:
+def test_the_fitted_light_can_be_shown(photograph: Photograph) -> None:
     rng = np.random.default_rng(22)
     pose, field = some_pose(rng), shadow_edge(rng)
     target = TARGET_PLATE.target

@@ -38,7 +38,7 @@ FIELDS = os.environ.get("KGCP_FIELDS", "")  # where the open sets of photographs
 JAICOV = Path(FIELDS) / "jaicov"
 
 
-def test_slopes_are_those_of_the_projection(rng: np.random.Generator) -> None:
+def test_derivatives_equal_those_of_the_projection(rng: np.random.Generator) -> None:
     free = PointPrior(simulated().network.points.nominal, np.zeros((35, 3, 3)))
     made = simulated(3, points=free)
     network, estimate = made.network, made.start(rng)
@@ -95,7 +95,7 @@ def test_wrong_discs_are_rejected_whole(rng: np.random.Generator) -> None:
     assert solution.estimate.cameras[0, 0] == pytest.approx(1510.0, abs=0.5)
 
 
-def test_a_free_field_finds_its_own_shape(rng: np.random.Generator) -> None:
+def test_the_shape_of_a_free_field_is_estimated(rng: np.random.Generator) -> None:
     """Known up to shift, turn and scale: what it has in common with the nominal one is kept."""
     bend = np.zeros((35, 3))
     bend[:, 2] = 0.0005 * rng.standard_normal(35)
@@ -154,7 +154,7 @@ def test_a_stiff_field_bends_no_further_than_its_prior_allows(rng: np.random.Gen
     assert precision(made.network, stiff).variance_factor == pytest.approx(1.0, abs=0.25)
 
 
-def test_what_all_discs_of_a_photograph_share_shows_in_the_clustered_deviations(
+def test_clustered_deviations_contain_errors_common_to_a_photograph(
     rng: np.random.Generator,
 ) -> None:
     """Each photograph with a lens of its own: the formal deviations do not know it."""
@@ -180,7 +180,7 @@ def test_what_all_discs_of_a_photograph_share_shows_in_the_clustered_deviations(
 
 
 @pytest.mark.parametrize(("places", "parameters"), [(3, 4), (5, 5), (12, 6)])
-def test_few_places_with_independent_errors_scatter_hardly_more_than_expected(
+def test_few_places_with_independent_errors_hardly_enlarge_deviations(
     rng: np.random.Generator, places: int, parameters: int
 ) -> None:
     """Chance makes an excess of 0.3 to 0.5 of the variances, were only what is below 0 cut off."""
@@ -195,7 +195,7 @@ def test_few_places_with_independent_errors_scatter_hardly_more_than_expected(
     assert found[is_more] == pytest.approx(np.linalg.eigvalsh(whole)[is_more], rel=0.05)
 
 
-def test_covariances_are_made_to_fit_the_residuals(rng: np.random.Generator) -> None:
+def test_covariances_are_scaled_to_the_residuals(rng: np.random.Generator) -> None:
     """Residuals that are too small scale them; what is too much is the same for all discs."""
     noisy = simulated().observed(rng)
     solution = adjust_network(noisy.network, noisy.truth)
@@ -207,7 +207,7 @@ def test_covariances_are_made_to_fit_the_residuals(rng: np.random.Generator) -> 
     assert added[0] == pytest.approx(SD_PX**2, rel=0.15)
 
 
-def test_what_cannot_be_told_apart_is_named() -> None:
+def test_inseparable_parameters_are_named() -> None:
     """Seen square on only, distance and focal length look the same; so do shift and centre."""
     assert tangled(("a", "b", "c"), np.diag([1.0, 4.0, 9.0]), 100.0) == ()
     alike = np.array([[1.0, 0.9999, 0.0], [0.9999, 1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -257,7 +257,7 @@ def test_points_may_be_eliminated_instead_of_poses(rng: np.random.Generator) -> 
     assert shares == pytest.approx(float(np.sum(blocks * information)), rel=1e-6)
 
 
-def test_what_rounding_makes_negative_is_not_determined() -> None:
+def test_variances_that_rounding_makes_negative_count_as_undetermined() -> None:
     """Straight views of a field of 80 discs leave −0.005 of the focal length: 1e-10 of it."""
     assert scales_of(np.diag([4.0, 0.25])).tolist() == [0.5, 2.0]
     with pytest.raises(np.linalg.LinAlgError):

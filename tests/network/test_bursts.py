@@ -45,7 +45,7 @@ def moved(truth: Estimate, view: int, turn: FloatArray, shift_m: FloatArray) -> 
     return replace(truth, rotations=rotations, translations=translations)
 
 
-def test_a_burst_states_no_smaller_deviations_than_its_errors(rng: np.random.Generator) -> None:
+def test_deviations_of_a_burst_cover_its_errors(rng: np.random.Generator) -> None:
     """Four photographs of each place have the lens of the place, and each its own noise."""
     once, burst = simulated(PLACES), repeated(simulated(PLACES), TIMES)
     ratios, gains = [], []
@@ -62,7 +62,7 @@ def test_a_burst_states_no_smaller_deviations_than_its_errors(rng: np.random.Gen
     assert 0.9 < np.median(gains) < 1.6
 
 
-def test_a_photograph_that_is_there_four_times_tells_what_it_tells_once(
+def test_a_photograph_repeated_four_times_counts_once(
     rng: np.random.Generator,
 ) -> None:
     once = with_own_lenses(simulated(PLACES), rng)
@@ -75,7 +75,7 @@ def test_a_photograph_that_is_there_four_times_tells_what_it_tells_once(
 
 
 @pytest.mark.parametrize("axis", AXES)
-def test_photographs_are_of_one_place_if_neither_centre_nor_rotation_differs(
+def test_photographs_with_equal_centre_and_rotation_are_of_one_place(
     axis: tuple[float, float, float],
 ) -> None:
     made = repeated(simulated(PLACES), 2)
@@ -91,7 +91,7 @@ def test_photographs_are_of_one_place_if_neither_centre_nor_rotation_differs(
         assert place_numbers(made.network, estimate).tolist() == expected
 
 
-def test_a_film_is_of_many_places() -> None:
+def test_frames_of_a_film_are_of_many_places() -> None:
     """Each photograph is near the one before; only those near the first one are of its place."""
     made = repeated(simulated(1), 24)
     estimate = made.truth
@@ -102,7 +102,7 @@ def test_a_film_is_of_many_places() -> None:
     assert np.bincount(numbers).tolist() == 6 * [4]
 
 
-def test_two_cameras_at_one_place_are_of_two() -> None:
+def test_two_cameras_at_one_place_count_as_two_places() -> None:
     made = repeated(simulated(3), 2)
     network = replace(made.network, view_camera=np.repeat([0, 1], 3))
     assert place_numbers(network, made.truth).tolist() == list(range(6))

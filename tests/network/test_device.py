@@ -17,7 +17,7 @@ CAMERA = Camera(4000, 3000, 3000.0, 3000.0, 1999.5, 1499.5)
 SQUARE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
 
 
-def test_points_are_told_apart_though_the_focal_length_is_not_known() -> None:
+def test_points_are_identified_without_a_known_focal_length() -> None:
     assert "right permutation in 100.00 % of 2, 0 wrong" in measure_devices(2, seed=1)
 
 
@@ -71,7 +71,7 @@ def device_images(points_m: FloatArray, rng: np.random.Generator, sd_px: float) 
     ],
     ids=["y the other way", "z the other way", "x and y exchanged", "too long"],
 )
-def test_a_device_that_is_built_otherwise_than_described_gives_no_pose(built: FloatArray) -> None:
+def test_a_device_that_differs_from_its_description_gives_no_pose(built: FloatArray) -> None:
     rng = np.random.default_rng(1)
     cov = np.repeat(0.02**2 * np.eye(2)[None], len(built), axis=0)
     reasons = []

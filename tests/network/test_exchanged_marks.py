@@ -37,7 +37,7 @@ def marked_frame(
 
 @pytest.mark.parametrize(("count", "least", "trials"), [(3, 0.7, 60), (4, 0.95, 20)])
 @pytest.mark.parametrize("tilt_deg", [5.0, 30.0])
-def test_exchanged_marks_are_told_from_right_ones(
+def test_exchanged_marks_are_found_and_right_ones_are_not(
     count: int, least: float, trials: int, tilt_deg: float
 ) -> None:
     rng = np.random.default_rng(5)
@@ -61,12 +61,12 @@ def test_names_that_are_exchanged_in_a_cycle_are_found(count: int, length: int) 
         assert exchanged_marks(exchanged, positions, CAMERA) == tuple(names)
 
 
-def test_two_marks_do_not_tell() -> None:
+def test_two_marks_cannot_show_an_exchange() -> None:
     marks, positions = marked_frame(np.random.default_rng(5), 2, 5.0)
     assert exchanged_marks(marks, positions, CAMERA) is None
 
 
-def test_three_in_a_line_do_not_tell() -> None:
+def test_three_marks_in_a_line_cannot_show_an_exchange() -> None:
     places = {f"T{at}": TargetPosition(np.array([4.0 * at, 0.0, 0.0]), None) for at in range(3)}
     marks = {f"T{at}": MarkedPlace(1000.0 + 500.0 * at, 1500.0, 2.0) for at in (1, 0, 2)}
     assert exchanged_marks(marks, places, CAMERA) is None

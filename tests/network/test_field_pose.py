@@ -77,7 +77,7 @@ def error_of(found: FieldPose, pose: CameraPose) -> FloatArray:
     [(BOARD, 0.0), (POSTS, 0.0), (POSTS, 0.1)],
     ids=["board", "posts", "posts beyond"],
 )
-def test_poses_are_as_good_as_stated(field: AnyField, beyond_px: float) -> None:
+def test_poses_are_as_accurate_as_stated(field: AnyField, beyond_px: float) -> None:
     rng = np.random.default_rng(3)
     z = []
     for _ in range(6):

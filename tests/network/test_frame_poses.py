@@ -47,7 +47,9 @@ def sightings_of(
 
 @pytest.mark.parametrize("targets", [4, 6])
 @pytest.mark.parametrize(("sd_own", "sd_alike"), [(0.001, 0.0), (0.0, 0.001)])
-def test_prints_are_off_one_by_one_or_alike(targets: int, sd_own: float, sd_alike: float) -> None:
+def test_individual_and_common_errors_of_prints_scatter_as_stated(
+    targets: int, sd_own: float, sd_alike: float
+) -> None:
     """Poses scatter as stated, however the stated deviation of the prints is shared out."""
     rng, z, used = np.random.default_rng(3), [], 0
     names = [f"T{index}" for index in range(targets)]
@@ -73,7 +75,7 @@ def test_prints_are_off_one_by_one_or_alike(targets: int, sd_own: float, sd_alik
 
 
 @pytest.mark.parametrize("wrong", [0.8, 1.25])
-def test_diameters_off_by_half_are_told_whatever_the_focal_length(wrong: float) -> None:
+def test_diameters_off_by_half_are_reported_even_with_an_unknown_focal_length(wrong: float) -> None:
     """Positions and images tell the focal length; distances were measured by a wrong one."""
     camera = replace(CAMERA, fx=wrong * CAMERA.fx, fy=wrong * CAMERA.fy, k1=wrong**2 * CAMERA.k1)
     places_m = np.array([[-4, -3, 0], [4, -3, 2.5], [4, 3, -2], [-4, 3, 2], [0, 1, -1.5]], float)
@@ -87,7 +89,7 @@ def test_diameters_off_by_half_are_told_whatever_the_focal_length(wrong: float) 
     assert "the distances are 50 % shorter than the positions say" in found.reason
 
 
-def test_a_print_that_sightings_and_flight_state_counts_once() -> None:
+def test_a_print_accuracy_in_sightings_and_flight_counts_once() -> None:
     """Targets near each other: how far away the camera is, their distances say."""
     offsets_m = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.2, 0.0]])
     seen = POSE.in_camera(offsets_m)
@@ -111,7 +113,7 @@ def test_a_print_that_sightings_and_flight_state_counts_once() -> None:
 @pytest.mark.parametrize(
     ("sd_scale", "sd_common"), [(0.002, 0.0), (0.002, 0.002), (0.002, 0.001), (0.001, 0.002)]
 )
-def test_a_ring_alone_is_as_sure_as_the_less_sure_of_both_says(
+def test_a_single_ring_uses_the_larger_of_both_stated_deviations(
     sd_scale: float, sd_common: float
 ) -> None:
     """What its sighting and the flight state of the same print counts once."""
@@ -158,7 +160,7 @@ def test_a_ring_alone_is_as_sure_as_the_less_sure_of_both_says(
 
 
 @pytest.mark.parametrize(("frames", "flights"), [(5, 7), (9, 8)])
-def test_a_ring_alone_shares_the_errors_of_positions_with_all_frames(
+def test_a_single_ring_has_the_position_errors_common_to_all_frames(
     frames: int, flights: int
 ) -> None:
     """More frames do not tell better how its plate lies, if the other targets are misplaced."""

@@ -58,7 +58,7 @@ def checked(
 
 
 @pytest.mark.parametrize(("targets", "named"), [(4, (2.2, 3.6)), (6, (1.05, 2.0))])
-def test_the_wrong_one_is_among_the_named_and_few_others(
+def test_the_wrong_position_is_named_among_few_others(
     targets: int, named: tuple[float, float]
 ) -> None:
     """Four targets hardly tell which of them is wrong, six do."""
@@ -73,15 +73,13 @@ def test_the_wrong_one_is_among_the_named_and_few_others(
 
 @pytest.mark.parametrize("sd_m", [0.0003, 0.01])
 @pytest.mark.parametrize("noise", [0.1, 1.0, 10.0])
-def test_images_worse_or_better_than_stated_contradict_no_position(
-    sd_m: float, noise: float
-) -> None:
+def test_image_noise_other_than_stated_contradicts_no_position(sd_m: float, noise: float) -> None:
     """What no positions explain widens the images' covariances."""
     found = [checked(6, seed, sd_m=sd_m, noise=noise)[1] for seed in range(12)]
     assert found == [None] * 12
 
 
-def test_a_wrong_position_is_told_in_images_worse_than_stated() -> None:
+def test_a_wrong_position_is_found_with_images_worse_than_stated() -> None:
     found = [checked(6, seed, off_m=0.1, noise=10.0) for seed in range(12)]
     told = [(true, wrong) for true, wrong in found if wrong is not None]
     assert len(told) >= 11

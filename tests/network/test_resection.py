@@ -38,7 +38,7 @@ def images_of(points: FloatArray, seen: FloatArray | None = None) -> PointImages
     )
 
 
-def test_most_poses_are_right_though_a_third_of_the_names_is_wrong() -> None:
+def test_most_poses_are_right_with_a_third_of_wrong_names() -> None:
     outcome = measure(Setup(points=8, has_distance=False, frames=6, seed=3))
     assert outcome.wrong == 0
     assert outcome.refused.total() <= 1
@@ -77,7 +77,7 @@ def test_four_points_alone_must_fit_well() -> None:
         orient(CAMERA, images_of(points[:4], seen[:4]))
 
 
-def test_what_all_distances_are_off_by_is_found_beside_a_wrong_name() -> None:
+def test_a_common_scale_of_distances_is_found_beside_a_wrong_name() -> None:
     points = np.random.default_rng(6).uniform(-6.0, 6.0, (6, 3)) * [1.0, 1.0, 0.2]
     seen = points.copy()
     seen[[1, 4]] = seen[[4, 1]]
@@ -124,7 +124,7 @@ def misfitting(images: PointImages, chi2: float) -> PointImages:
         (4, 1, None),
     ],
 )
-def test_only_few_checks_must_agree_well(
+def test_the_limit_of_chi2_is_stricter_with_few_redundant_observations(
     count: int, distances: int, most_chi2: float | None
 ) -> None:
     images = images_of(ROUGH[:count])
@@ -142,7 +142,7 @@ def test_only_few_checks_must_agree_well(
                 orient(CAMERA, wrong)
 
 
-def test_deviations_hold_on_the_bend_of_points_nearly_in_a_line() -> None:
+def test_deviations_are_right_for_points_nearly_in_a_line() -> None:
     """A turn about the line that is good to some degrees moves the camera along an arc."""
     rng = np.random.default_rng(8)
     squares = []
@@ -172,7 +172,7 @@ def test_deviations_hold_on_the_bend_of_points_nearly_in_a_line() -> None:
     assert max(squares) < 30.0
 
 
-def test_a_plane_seen_from_the_front_may_be_tilted_either_way() -> None:
+def test_a_plane_seen_from_the_front_has_two_possible_tilts() -> None:
     """In the 36th frame the mirrored pose is no solution of its own, but nearly as likely."""
     outcome = measure(Setup(points=5, has_distance=False, frames=36, seed=0))
     assert outcome.wrong == 0
@@ -188,6 +188,6 @@ def test_a_plane_seen_from_the_front_may_be_tilted_either_way() -> None:
         (np.arange(5.0)[:, None] * [1.5, 0.5, 0.0], "no triple|hardly determine|fit alike"),
     ],
 )
-def test_too_little_is_no_pose(points: FloatArray, problem: str) -> None:
+def test_too_few_points_give_no_pose(points: FloatArray, problem: str) -> None:
     with pytest.raises(NoPoseError, match=problem):
         orient(CAMERA, images_of(points))

@@ -134,7 +134,7 @@ def test_a_camera_that_flies_on_does_not_lift_the_targets() -> None:
     assert 0.6 < float(np.sqrt(np.mean(np.square(z)))) < 1.3
 
 
-def test_deviations_of_a_motion_that_nothing_tells_are_those_of_all_frames() -> None:
+def test_unknown_motion_has_a_deviation_common_to_all_frames() -> None:
     """A camera as fast as `motion_sd_deg_s` says displaces heights by about one deviation."""
     rng, z = np.random.default_rng(5), []
     for _ in range(6):

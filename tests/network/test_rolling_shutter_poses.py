@@ -115,7 +115,7 @@ def places_of(flight: GroundFlight, rng: np.random.Generator) -> dict[str, Targe
 
 
 @pytest.mark.parametrize("targets", [4, 6])
-def test_unknown_motion_is_in_the_deviations(targets: int) -> None:
+def test_deviations_cover_unknown_motion(targets: int) -> None:
     """Poses are those of the middle row; all targets agree and none is thought misplaced."""
     rng, z, off_px = np.random.default_rng(5), [], []
     for seed in range(2):
@@ -163,7 +163,7 @@ def test_the_camera_s_rates_make_poses_more_certain() -> None:
 
 
 @pytest.mark.parametrize("shift_sd_m_s", [0.0, 29.0 * SD_RAD_S])
-def test_a_ring_alone_is_seen_at_its_own_row(shift_sd_m_s: float) -> None:
+def test_a_single_ring_is_exposed_at_its_own_row(shift_sd_m_s: float) -> None:
     """Its pose is brought to the middle row, if the camera's rates tell all of the motion."""
     rng, z = np.random.default_rng(7), []
     for seed in range(12):
@@ -192,7 +192,7 @@ def test_a_ring_alone_is_seen_at_its_own_row(shift_sd_m_s: float) -> None:
 
 
 @pytest.mark.parametrize("field", [fields.BOARD, fields.POSTS], ids=["board", "posts"])
-def test_fields_in_frames_of_a_moving_camera(field: AnyField) -> None:
+def test_poses_from_fields_allow_for_a_moving_camera(field: AnyField) -> None:
     rng, z = np.random.default_rng(8), []
     rolling = replace(fields.CAMERA, readout_s=READOUT_S)
     for _ in range(8):

@@ -40,7 +40,7 @@ def heights(shapes: FloatArray) -> FloatArray:
     return np.asarray(shapes.T @ shapes) / len(shapes)
 
 
-def test_shapes_are_of_second_order_and_nothing_that_a_pose_does() -> None:
+def test_bending_shapes_are_of_second_order_and_independent_of_the_pose() -> None:
     points = simulated().network.points.nominal
     shapes = bend_shapes(points)
     plane = np.column_stack((np.ones(35), points[:, :2]))
@@ -48,7 +48,7 @@ def test_shapes_are_of_second_order_and_nothing_that_a_pose_does() -> None:
     assert np.allclose(plane.T @ shapes, 0.0, atol=1e-12)
 
 
-def test_slopes_by_bends_are_those_of_the_projection(rng: np.random.Generator) -> None:
+def test_derivatives_by_bends_equal_those_of_the_projection(rng: np.random.Generator) -> None:
     made = bent(rng)
     network, truth = made.network, made.truth
     view = view_rows(network, truth, np.ones(350))[3]
@@ -74,7 +74,7 @@ def test_points_may_be_eliminated_instead_of_poses_and_bends(rng: np.random.Gene
     assert np.allclose(by_points.cameras, by_poses.cameras, rtol=1e-9, atol=1e-9)
 
 
-def test_bends_are_found_with_their_deviation_and_the_camera_is_as_good_as_stated(
+def test_bends_and_camera_are_as_accurate_as_stated(
     rng: np.random.Generator,
 ) -> None:
     """A sheet that is taken for rigid costs the camera ten times its accuracy."""

@@ -113,7 +113,7 @@ def test_a_frame_that_shows_something_else_is_left_out() -> None:
     assert angle_deg(fit.circle.normal, truth.normal) < 0.3
 
 
-def test_frames_from_one_direction_leave_two_normals() -> None:
+def test_frames_from_one_direction_allow_two_normals() -> None:
     truth = circle_of(10.0)
     around = views_of(truth, np.random.default_rng(5), tilt_deg=(25.0, 26.0))
     one_side = around.chosen(np.arange(8) == 0)
@@ -148,7 +148,7 @@ def test_noise_beyond_the_stated_one_is_learnt() -> None:
     assert all(not isinstance(each, NoCircleError) for each in placed)
 
 
-def test_what_all_frames_share_is_stated_apart() -> None:
+def test_errors_common_to_all_frames_are_stated_separately() -> None:
     truth = circle_of(20.0)
     views = views_of(truth, np.random.default_rng(8))
     fit = place_circle(CAMERA, views).fit
@@ -161,7 +161,7 @@ def test_what_all_frames_share_is_stated_apart() -> None:
     assert math.sqrt(edge[5, 5]) == pytest.approx(0.02 / 20.0 * truth.radius_m, rel=0.2)
 
 
-def test_rays_that_do_not_meet_are_no_circle() -> None:
+def test_rays_that_do_not_meet_give_no_circle() -> None:
     views = views_of(circle_of(10.0), np.random.default_rng(9), frames=3)
     backwards = CircleViews(
         views.camera_m,
@@ -195,7 +195,7 @@ def test_a_move_is_found_where_it_happened(frames: int, steps: float) -> None:
 
 
 @pytest.mark.parametrize("frames", [6, 8, 12, 30])
-def test_circles_that_stay_are_not_moved(frames: int) -> None:
+def test_circles_that_were_not_moved_show_no_move(frames: int) -> None:
     rng, truth, gains = np.random.default_rng(13), circle_of(10.0), []
     for _ in range(40):
         views = views_of(truth, rng, frames=frames)
@@ -206,7 +206,7 @@ def test_circles_that_stay_are_not_moved(frames: int) -> None:
     assert max(gains) < 0.9
 
 
-def test_poses_that_drift_move_no_single_circle() -> None:
+def test_drifting_poses_are_not_taken_for_a_moved_circle() -> None:
     """Errors of poses that follow each other displace all circles of a frame alike."""
     rng, truth = np.random.default_rng(14), circle_of(10.0)
     many = [views_of(truth, rng, frames=16) for _ in range(5)]
@@ -219,7 +219,7 @@ def test_poses_that_drift_move_no_single_circle() -> None:
     assert noise.centre_px > 0.03
 
 
-def test_a_bad_outline_among_many_good_ones_has_deviations_of_its_own() -> None:
+def test_a_bad_outline_among_good_ones_has_its_own_larger_deviations() -> None:
     """Its places are as good as theirs, and its shapes are forty times as bad as stated."""
     rng, truth = np.random.default_rng(7), circle_of(10.0)
     many = [views_of(truth, rng, frames=5) for _ in range(20)]

@@ -66,7 +66,7 @@ class TellingPool(WorkerPool):
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_a_tone_that_compression_hides_is_warned_of(jobs: int) -> None:
+def test_a_tone_curve_hidden_by_compression_causes_a_warning(jobs: int) -> None:
     pool = TellingPool(jobs, SerialExecutor(), (), Counter())
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -77,13 +77,13 @@ def test_a_tone_that_compression_hides_is_warned_of(jobs: int) -> None:
     assert learned.is_reliable is (jobs == 1)
 
 
-def test_a_tone_that_cannot_be_learned_together_is_reliable() -> None:
+def test_without_a_learned_tone_there_is_a_warning_and_no_common_tone() -> None:
     pool = LosingPool(1, SerialExecutor(), (), Counter())
     with pytest.warns(KgcpWarning, match="has ended or taken too long"):
         assert _camera_of(pool, cast("PhotoTask", None), ()) is None
 
 
-def test_what_was_measured_with_another_tone_is_measured_anew(tmp_path: Path) -> None:
+def test_photographs_measured_with_another_tone_are_measured_again(tmp_path: Path) -> None:
     """Of other photographs, another tone is learned."""
     photo = Photo("a.png", tmp_path / "a.png")
     photo.path.write_bytes(b"nothing")

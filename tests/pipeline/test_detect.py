@@ -148,7 +148,7 @@ def without_attitudes(flight: Path, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.mark.parametrize("edits", [(), (LEVEL,)])
-def test_attitudes_of_vehicle_and_camera_find_the_right_side(
+def test_attitudes_of_vehicle_and_camera_choose_the_right_normal(
     flight: Path, without_attitudes: Path, tmp_path: Path, edits: tuple[tuple[str, str], ...]
 ) -> None:
     summary = detect(flight, tmp_path / "level", *edits)
@@ -165,7 +165,7 @@ def test_attitudes_of_vehicle_and_camera_find_the_right_side(
     assert surer.between(0.99, 1.0).all(), "the other pose is hardly elsewhere"
 
 
-def test_a_second_look_finds_what_the_reference_promises(
+def test_a_second_look_finds_targets_predicted_by_the_reference(
     tiny: Path, guided: GuidedRuns, tmp_path: Path
 ) -> None:
     alone = DetectSettings(is_guided=False)
@@ -184,7 +184,9 @@ def test_a_second_look_finds_what_the_reference_promises(
     assert details.str.contains("expected by the reference at").all()
 
 
-def test_a_reference_that_cannot_guide_is_told_and_no_error(tiny: Path, tmp_path: Path) -> None:
+def test_an_unusable_reference_for_the_second_look_is_only_a_warning(
+    tiny: Path, tmp_path: Path
+) -> None:
     late = ("[vehicle]\n", "[vehicle]\ntime_offset_s = 5000.0\n")
     summary = detect(tiny, tmp_path / "out", late)
     assert summary.guided == 0
@@ -194,7 +196,7 @@ def test_a_reference_that_cannot_guide_is_told_and_no_error(tiny: Path, tmp_path
     assert detect(tiny, tmp_path / "out", missing).guide_problem is None
 
 
-def test_dropped_rings_are_further_cards_of_the_sheet(guided: GuidedRuns) -> None:
+def test_dropped_rings_have_cards_in_the_contact_sheet(guided: GuidedRuns) -> None:
     outcomes, serial, parallel = (
         (sheet / "index.html").read_text(encoding="utf-8") for sheet in guided.sheets
     )
@@ -212,7 +214,7 @@ def test_dropped_rings_are_further_cards_of_the_sheet(guided: GuidedRuns) -> Non
     assert len(pictures[0]) == serial.count("<img ")
 
 
-def test_jobs_and_pictures_leave_guided_tables_as_they_are(guided: GuidedRuns) -> None:
+def test_tables_do_not_depend_on_jobs_or_pictures(guided: GuidedRuns) -> None:
     first, with_candidates, with_jobs = guided.tables
     assert first == with_candidates == with_jobs
 
@@ -228,7 +230,7 @@ def test_without_reference_poses_the_camera_is_plumb_or_unknown(
         detect(flight, tmp_path / "c", plumb)
 
 
-def test_common_errors_stand_apart(flight: Path, tmp_path: Path) -> None:
+def test_common_errors_have_separate_columns(flight: Path, tmp_path: Path) -> None:
     plain_out, out = tmp_path / "plain", tmp_path / "common"
     detect(flight, plain_out)
     cov = 'cov_of = ["fx", "fy"]\ncov = [4.0, 4.0, 4.0, 4.0]\n'
@@ -242,7 +244,7 @@ def test_common_errors_stand_apart(flight: Path, tmp_path: Path) -> None:
     pd.testing.assert_frame_equal(plain.drop(columns=added), common.drop(columns=added))
 
 
-def test_an_unreadable_frame_is_a_row_among_the_others(flight: Path, tmp_path: Path) -> None:
+def test_an_unreadable_frame_becomes_a_row_among_the_others(flight: Path, tmp_path: Path) -> None:
     folder = tmp_path / "flight"
     (folder / "frames" / "east").mkdir(parents=True)
     toml = (flight / "flight.toml").read_text(encoding="utf-8")

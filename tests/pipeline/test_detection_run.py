@@ -92,7 +92,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Looks], No
 
 
 @pytest.mark.parametrize(("enough", "asked"), [(8, 8), (9, 16), (17, 32), (33, 40)])
-def test_batches_over_both_bases_double_until_the_base_is_told(
+def test_batches_over_both_bases_double_until_the_base_is_decided(
     run: Callable[[Looks], None], enough: int, asked: int
 ) -> None:
     """Each of them lies evenly among all frames."""
@@ -104,7 +104,7 @@ def test_batches_over_both_bases_double_until_the_base_is_told(
     assert np.diff([*rows, len(FRAMES)]).max() <= 2 * len(FRAMES) // asked
 
 
-def test_a_second_look_is_resumed_over_the_base_that_the_journal_tells(
+def test_a_second_look_is_resumed_over_the_base_in_the_journal(
     run: Callable[[Looks], None],
 ) -> None:
     interrupted = Looks(ToneBase.LINE, enough=8, last=len(FRAMES) + 2)

@@ -42,7 +42,7 @@ def frame(folder: Path, name: str, subsec: str) -> None:
         (("", ""), "1.png,2026-05-04T09:30:01Z\n2.png,2026-05-04T09:30:02Z\n", 0),
     ],
 )
-def test_only_times_that_are_used_count(
+def test_only_exif_times_that_are_used_count_as_whole_seconds(
     tmp_path: Path, subsecs: tuple[str, str], times: str, count: int
 ) -> None:
     (tmp_path / "frames").mkdir()

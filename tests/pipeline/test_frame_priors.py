@@ -23,7 +23,7 @@ def priors(flight: Flight) -> dict[str, dict[str, PlatePrior]]:
     return {frame: dict(each) for frame, each in zip(frames, known, strict=True)}
 
 
-def test_attitudes_tell_where_normals_point() -> None:
+def test_priors_of_normals_follow_from_attitudes() -> None:
     known = priors(read_flight(SAMPLE))
     normals = [prior.normal for each in known.values() for prior in each.values()]
     assert len(normals) == len(known)
@@ -39,7 +39,7 @@ def test_a_target_that_stands_still_is_not_taken_for_the_vehicle_s() -> None:
     assert not any(priors(replace(flight, targets=static)).values())
 
 
-def test_files_that_cannot_be_read_tell_nothing(tmp_path: Path) -> None:
+def test_unreadable_files_give_no_priors(tmp_path: Path) -> None:
     flight = read_flight(SAMPLE)
     assert flight.reference is not None
     bad = tmp_path / "reference.csv"
@@ -48,7 +48,7 @@ def test_files_that_cannot_be_read_tell_nothing(tmp_path: Path) -> None:
     assert not any(priors(replace(flight, reference=None)).values())
 
 
-def test_a_plate_that_is_said_to_be_level_does_without_a_trajectory(tmp_path: Path) -> None:
+def test_a_plate_stated_to_be_level_needs_no_trajectory(tmp_path: Path) -> None:
     flight = read_flight(SAMPLE)
     assert flight.vehicle is not None
     bad = tmp_path / "vehicle.csv"
@@ -62,7 +62,7 @@ def test_a_plate_that_is_said_to_be_level_does_without_a_trajectory(tmp_path: Pa
 
 
 @pytest.mark.parametrize("sd_deg_s", [5.0, 40.0])
-def test_frames_before_and_after_tell_of_motion_while_rows_are_read(sd_deg_s: float) -> None:
+def test_neighbouring_frames_determine_the_motion_during_readout(sd_deg_s: float) -> None:
     flight = read_flight(SAMPLE)
     camera = replace(flight.camera, readout_s=0.02, motion_sd_deg_s=sd_deg_s)
     known = priors(replace(flight, camera=camera))
@@ -74,7 +74,7 @@ def test_frames_before_and_after_tell_of_motion_while_rows_are_read(sd_deg_s: fl
     assert (sds < sd_deg_s).sum() > len(known) // 2
 
 
-def test_motion_about_a_plain_target_is_known_too() -> None:
+def test_the_motion_is_also_known_for_plain_targets() -> None:
     flight = read_flight(SAMPLE)
     camera = replace(flight.camera, readout_s=0.02)
     plain = PlainTarget(
@@ -88,7 +88,7 @@ def test_motion_about_a_plain_target_is_known_too() -> None:
     assert min(sds) < np.radians(camera.motion_sd_deg_s)
 
 
-def test_rates_beside_the_times_are_the_camera_s(tmp_path: Path) -> None:
+def test_rates_in_the_times_file_are_those_of_the_camera(tmp_path: Path) -> None:
     flight = read_flight(SAMPLE)
     assert flight.times_file is not None
     head, *rows = flight.times_file.read_text(encoding="utf-8").splitlines()

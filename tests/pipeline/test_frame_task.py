@@ -64,7 +64,7 @@ def look_twice(
     return first, examine_frame_again(job, GuidedInput(FRAME_INPUT, first, expected))
 
 
-def test_what_is_found_again_explains_no_other_s_miss(folder: Path) -> None:
+def test_a_target_found_again_does_not_explain_another_target_s_miss(folder: Path) -> None:
     first, second = look_twice(folder, {"A": PREDICTION})
     assert all(isinstance(one, Miss) and one.candidates == 2 for one in first.outcomes)
     found, missed = second.outcomes
@@ -86,7 +86,7 @@ def test_a_miss_is_explained_by_the_ring_at_the_expected_place(folder: Path) -> 
     assert missed.detail.startswith(f"ring at ({x:.0f}, {y:.0f}), radius 13.")
 
 
-def test_where_nothing_is_the_first_reason_stays(folder: Path) -> None:
+def test_the_first_reason_is_kept_if_nothing_is_at_the_predicted_place(folder: Path) -> None:
     away = replace(PREDICTION, centre_px=np.array([400.0, 60.0]))
     first, second = look_twice(folder, {"A": away, "B": away})
     assert second.outcomes == first.outcomes
@@ -151,7 +151,7 @@ def test_outcomes_are_completed_together_as_one_by_one(folder: Path) -> None:
         assert outcome.eccentricity_px == pytest.approx(expected.eccentricity_px, abs=1e-11)
 
 
-def test_what_is_known_of_motion_goes_with_a_plain_target_s_prediction(
+def test_the_known_motion_is_part_of_a_plain_target_s_prediction(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[SceneRotation | None] = []

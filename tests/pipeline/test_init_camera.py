@@ -50,7 +50,7 @@ def guessed_fx(header: FrameHeader) -> object:
         (FrameHeader("a.jpg", (4000, 3000), focal_mm=4.5, focal_px=2904.4), 2917.0),
     ],
 )
-def test_guesses_are_near_what_the_makers_say(header: FrameHeader, fx: float) -> None:
+def test_guessed_focal_lengths_are_near_those_of_the_makers(header: FrameHeader, fx: float) -> None:
     assert guessed_fx(header) == pytest.approx(fx, rel=0.005)
 
 

@@ -75,7 +75,7 @@ INJECTIONS = (
 )
 
 
-def test_what_is_wrong_in_flight_toml_is_named_with_its_amount(tmp_path: Path) -> None:
+def test_errors_in_flight_toml_are_named_with_their_amount(tmp_path: Path) -> None:
     flight = tmp_path / "flight"
     shutil.copytree(SAMPLE, flight, ignore=shutil.ignore_patterns("kgcp"))
     detect_flight(read_flight(flight), options=RunOptions(jobs=0))

@@ -107,7 +107,7 @@ def test_every_frame_has_its_card_and_every_ring_its_picture(flight: Path, tmp_p
     assert coloured.mean() < 0.001, "a good fit leaves pale noise"
 
 
-def test_a_run_that_was_stopped_while_drawing_goes_on(
+def test_a_run_stopped_while_drawing_can_be_resumed(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     detect(flight, tmp_path / "whole")
@@ -125,7 +125,7 @@ def test_a_run_that_was_stopped_while_drawing_goes_on(
     assert files(tmp_path / "sheet") == files(tmp_path / "whole")
 
 
-def test_a_frame_that_is_gone_when_it_is_drawn_is_a_line(
+def test_a_frame_that_vanished_before_drawing_is_reported_in_one_line(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clear = ContactSheet.clear
@@ -146,7 +146,7 @@ def test_a_frame_that_is_gone_when_it_is_drawn_is_a_line(
     assert "<img" in other
 
 
-def test_pictures_do_not_go_among_the_frames(flight: Path) -> None:
+def test_pictures_are_not_written_into_the_frames_folder(flight: Path) -> None:
     result = detect(flight, flight / "frames" / "sheet")
     assert result.exit_code == 1
     assert "is among the frames" in result.stderr
@@ -161,7 +161,7 @@ def test_the_paper_s_chain_is_drawn_too(flight: Path, tmp_path: Path) -> None:
     assert "±" not in seen
 
 
-def test_candidates_belong_to_a_sheet(flight: Path) -> None:
+def test_candidates_need_a_contact_sheet(flight: Path) -> None:
     result = CliRunner().invoke(main, ["detect", str(flight), "--all-candidates"])
     assert result.exit_code == 2
     assert "give --overlay DIR" in result.stderr
@@ -195,7 +195,7 @@ class _OneLost:
         yield 0, FrameResult("a.png", None, ExposureSettings(), (miss,)), TaskFailure.CRASHED
 
 
-def test_a_frame_that_ends_its_process_is_a_line(tmp_path: Path) -> None:
+def test_a_frame_that_crashes_its_process_is_reported_in_one_line(tmp_path: Path) -> None:
     sheet = ContactSheet(tmp_path / "sheet")
     job = DetectionJob(tmp_path, CAMERA, None, (), DetectSettings())
     assert draw_overlay(sheet, "<b>Süd</b>", cast("DetectionRun", _OneLost()), job, {}) == 1
@@ -203,7 +203,7 @@ def test_a_frame_that_ends_its_process_is_a_line(tmp_path: Path) -> None:
     assert "ring at (20, 30) · not drawn: the process that drew it ended twice" in card
 
 
-def test_where_a_missing_target_must_be_is_said(tmp_path: Path) -> None:
+def test_the_expected_place_of_a_missing_target_is_stated(tmp_path: Path) -> None:
     sheet = ContactSheet(tmp_path / "sheet")
     job = DetectionJob(tmp_path, CAMERA, None, (), DetectSettings())
     predictions = {0: {"A": Prediction(np.array([20.0, 30.0]), 2.0, 6.0, 0.04, "its neighbours")}}

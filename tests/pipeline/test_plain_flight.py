@@ -82,7 +82,7 @@ def test_every_target_is_measured_at_its_true_centre(folder: Path) -> None:
         assert_at(rows, FLIGHT.centres_m(frame)[: len(TARGETS)])
 
 
-def test_four_discs_orient_frames_check_a_vehicle_and_are_placed(folder: Path) -> None:
+def test_four_discs_can_orient_frames_check_a_vehicle_and_be_placed(folder: Path) -> None:
     """As docs/ground.md tells it, from detections to points."""
     flight = read_flight(folder)
     oriented = orient_flight(flight)
@@ -122,7 +122,7 @@ class Around(PlainFlight):
         return centres, np.array(rotations)
 
 
-def test_frames_tell_how_targets_lie_whatever_is_stated(tmp_path: Path) -> None:
+def test_placed_normals_do_not_depend_on_the_stated_ones(tmp_path: Path) -> None:
     """One on a roof, one said to be level, which is not: no frame's prior is in the result."""
     roof, tilted = (0.5, -0.2, 1.0), (-0.1, 0.05, 1.0)
     free = replace(plain_target("roof", (2.0, 2.0), 0.8), normal_enu=None)
@@ -156,11 +156,11 @@ def test_frames_tell_how_targets_lie_whatever_is_stated(tmp_path: Path) -> None:
         assert row["shape"] == "disc"
 
 
-def test_they_are_among_the_targets_of_a_check(folder: Path) -> None:
+def test_check_lists_plain_targets(folder: Path) -> None:
     assert "0.8 m, bright disc (static)" in run("check", folder)
 
 
-def test_another_position_makes_it_another_target(folder: Path, tmp_path: Path) -> None:
+def test_a_changed_position_makes_detections_stale(folder: Path, tmp_path: Path) -> None:
     """Its place is all that tells a plain target from others: points would be mixed up."""
     text = (folder / "flight.toml").read_text(encoding="utf-8")
     places = [line for line in text.splitlines() if line.startswith("position_m")]
@@ -173,7 +173,7 @@ def test_another_position_makes_it_another_target(folder: Path, tmp_path: Path) 
         make_gcps(read_flight(tmp_path), folder / "kgcp" / "detections.parquet")
 
 
-def test_without_poses_nothing_is_looked_for(folder: Path, tmp_path: Path) -> None:
+def test_plain_targets_are_not_searched_without_poses(folder: Path, tmp_path: Path) -> None:
     text = (folder / "flight.toml").read_text(encoding="utf-8")
     share(folder / "frames", tmp_path / "frames")
     bare = text.replace('[reference]\nposes = "reference.csv"\n', "")
@@ -184,7 +184,7 @@ def test_without_poses_nothing_is_looked_for(folder: Path, tmp_path: Path) -> No
     assert set(table["target"][table["status"] == "measured"]) == {"car"}
 
 
-def test_coded_targets_of_the_frame_tell_where_they_are(tmp_path: Path) -> None:
+def test_coded_targets_in_the_frame_predict_plain_targets(tmp_path: Path) -> None:
     made = PlainFlight(frames=1, coded=CODED)
     made.write(tmp_path)
     (tmp_path / "reference.csv").unlink()
@@ -204,7 +204,7 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_marks_by_hand_tell_where_they_are(bare: Path) -> None:
+def test_manual_marks_predict_plain_targets(bare: Path) -> None:
     centres_m = PlainFlight(frames=1).centres_m(0)
     lines = ["frame,target,x_px,y_px"]
     for target, place in zip(TARGETS, CAMERA.project(centres_m), strict=True):
@@ -270,7 +270,7 @@ class Passage(PlainFlight):
             cv2.imwrite(str(folder / f"f_{frame}.png"), Sensor().expose(light, 1.0, rng))
 
 
-def test_frames_before_and_after_tell_where_they_are(tmp_path: Path) -> None:
+def test_neighbouring_frames_predict_plain_targets(tmp_path: Path) -> None:
     targets = (plain_target("white", (-2.0, -1.5), 0.8), plain_target("black", (2.0, 1.5), 0.9))
     made = Passage(targets=targets, frames=6)
     made.write(tmp_path)
@@ -311,7 +311,7 @@ def test_frames_before_and_after_tell_where_they_are(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_one_line_for_wrong_marks(bare: Path, text: str, message: str) -> None:
+def test_wrong_marks_are_a_one_line_error(bare: Path, text: str, message: str) -> None:
     path = bare / "wrong.csv"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(KgcpError) as caught:

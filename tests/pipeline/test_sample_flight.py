@@ -23,8 +23,8 @@ def plan() -> FlightPlan:
     return plan_flight(preset("sample"), DEFAULT_SEED)
 
 
-def test_texts_are_remade_byte_for_byte(plan: FlightPlan, tmp_path: Path) -> None:
-    """On Windows, whose sines round otherwise, but for last digits."""
+def test_text_files_are_reproduced_byte_for_byte(plan: FlightPlan, tmp_path: Path) -> None:
+    """On Windows, whose sines are rounded differently, only to the last digits."""
     write_texts(plan, tmp_path)
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == sorted(path.name for path in SAMPLE.iterdir() if path.is_file())
@@ -38,7 +38,7 @@ def test_texts_are_remade_byte_for_byte(plan: FlightPlan, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("index", [1, 12])
-def test_frames_are_remade(plan: FlightPlan, index: int) -> None:
+def test_frames_are_reproduced(plan: FlightPlan, index: int) -> None:
     stored = (SAMPLE / f"frames/frame_{index:04d}.jpg").read_bytes()
     remade = encode_frame(plan, index, render_frame(plan, grow_ground(plan.seed), index))
     if remade == stored:
@@ -50,7 +50,7 @@ def test_frames_are_remade(plan: FlightPlan, index: int) -> None:
     assert np.abs(one - other).mean() < 0.02
 
 
-def test_the_sample_shows_what_it_should(plan: FlightPlan) -> None:
+def test_the_sample_flight_has_near_far_and_empty_frames(plan: FlightPlan) -> None:
     distances = [frame.target.distance_m for frame in plan.frames if frame.present]
     assert min(distances) < 10.0
     assert max(distances) > 90.0

@@ -56,7 +56,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> tuple[FlightPlan, Path]:
     return write(SMALL, out), out
 
 
-def test_the_folder_is_a_flight(flight: tuple[FlightPlan, Path]) -> None:
+def test_the_simulated_folder_is_a_valid_flight(flight: tuple[FlightPlan, Path]) -> None:
     plan, out = flight
     read = read_flight(out)
     assert read.camera == SMALL.camera
@@ -90,7 +90,7 @@ def test_png_frames_are_what_was_rendered(flight: tuple[FlightPlan, Path]) -> No
     assert_array_equal(grey, render_frame(plan, grow_ground(3), 2))
 
 
-def test_exif_tells_exposure_and_time(flight: tuple[FlightPlan, Path]) -> None:
+def test_exif_has_exposure_and_time(flight: tuple[FlightPlan, Path]) -> None:
     plan, out = flight
     for frame in plan.frames:
         exif = read_exif(out / f"frames/frame_{frame.index:04d}.png")
@@ -162,7 +162,7 @@ def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
     assert contents(tmp_path) == {}
 
 
-def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_created_is_a_one_line_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(KgcpError, match="cannot be written"):
         write(SMALL, tmp_path / "file" / "flight")

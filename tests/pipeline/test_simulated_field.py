@@ -53,7 +53,7 @@ def rows(path: Path) -> Iterator[dict[str, str]]:
         yield from csv.DictReader(stream)
 
 
-def test_the_truth_is_where_the_discs_are(folder: Path) -> None:
+def test_the_written_truth_agrees_with_the_discs_in_the_photographs(folder: Path) -> None:
     field = read_field(str(folder / "field.toml"))
     camera, covariance = read_camera_file(folder / "true_camera.toml")
     assert (field, camera, covariance) == (FIELD, CAMERA, None)
@@ -75,7 +75,7 @@ def test_the_truth_is_where_the_discs_are(folder: Path) -> None:
         assert 0.7 <= float(row["gain"]) <= 1.0
 
 
-def test_the_camera_is_found_again(folder: Path, tmp_path: Path) -> None:
+def test_calibration_recovers_the_simulated_camera(folder: Path, tmp_path: Path) -> None:
     settings = CalibrationSettings(lens=LensModel.RADIAL)
     options = CalibrationOptions(settings, Response.LINEAR, Operator.CENTROID, jobs=0)
     photos = find_photos([folder / "photos"])
@@ -99,7 +99,7 @@ def test_names_and_exposures_follow_the_settings() -> None:
 
 
 @pytest.mark.parametrize("name", ["shadow", "dirty", "glare", "rolling"])
-def test_light_of_plates_is_told_apart(name: str) -> None:
+def test_presets_with_uneven_light_are_refused_for_fields(name: str) -> None:
     with pytest.raises(KgcpError, match="without"):
         FieldSimulation(FIELD, preset(name), 1)
 
@@ -120,7 +120,7 @@ def coded_field() -> PointField:
     return PointField("depth", tuple(points), flat_sd_m=sds, code=CodeRing(8, 2.1, 2.9))
 
 
-def test_a_field_with_depth_is_calibrated_with(tmp_path: Path) -> None:
+def test_a_simulated_field_with_depth_can_be_calibrated_with(tmp_path: Path) -> None:
     field = coded_field()
     settings = replace(SETTINGS, frames=3)
     out = tmp_path / "session"

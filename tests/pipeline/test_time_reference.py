@@ -39,13 +39,13 @@ def folder(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("reference", "mid_exposure_s"), [("start", 1000.01), ("middle", 1000.0), ("end", 999.99)]
 )
-def test_times_of_start_and_end_are_brought_to_mid_exposure(
+def test_times_of_start_or_end_are_converted_to_mid_exposure(
     folder: Path, reference: str, mid_exposure_s: float
 ) -> None:
     assert _time_s(folder, reference) == pytest.approx(mid_exposure_s, abs=1e-6)
 
 
-def test_an_unknown_exposure_time_is_one_line_unless_it_does_not_matter(folder: Path) -> None:
+def test_an_unknown_exposure_time_is_an_error_only_if_it_matters(folder: Path) -> None:
     assert _time_s(folder, "middle", "bare.jpg") == 1000.0
     with pytest.raises(KgcpError, match=r"bare.jpg: has no exposure time.* 'end'") as caught:
         _time_s(folder, "end", "bare.jpg")

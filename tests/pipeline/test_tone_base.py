@@ -106,7 +106,7 @@ def table(out: Path) -> bytes:
     return (out / "detections.parquet").read_bytes()
 
 
-def test_some_frames_tell_it_and_the_others_are_measured_over_it_alone(
+def test_the_first_frames_decide_the_base_for_all_others(
     flight: Path, tmp_path: Path, bases: dict[str, ToneBase | None]
 ) -> None:
     summary = detect(flight, tmp_path)
@@ -117,7 +117,7 @@ def test_some_frames_tell_it_and_the_others_are_measured_over_it_alone(
     assert summary.status["measured"] == FRAMES
 
 
-def test_alone_they_are_measured_over_both(
+def test_without_learning_every_frame_is_measured_over_both_bases(
     flight: Path, tmp_path: Path, bases: dict[str, ToneBase | None]
 ) -> None:
     summary = detect(flight, tmp_path, is_learning=False)
@@ -137,7 +137,7 @@ def test_where_the_first_frames_disagree_all_are_measured_over_both(
 
 
 @pytest.mark.parametrize("looks", [3, ASKED, ASKED + 2])
-def test_an_interrupted_run_goes_on_over_the_same_base(
+def test_a_resumed_run_uses_the_same_base(
     flight: Path, tmp_path: Path, bases: dict[str, ToneBase | None], looks: int
 ) -> None:
     detect(flight, tmp_path / "undisturbed")
@@ -153,7 +153,7 @@ def test_an_interrupted_run_goes_on_over_the_same_base(
     assert table(tmp_path / "out") == table(tmp_path / "undisturbed")
 
 
-def test_what_decides_does_not_depend_on_the_number_of_workers(
+def test_the_choice_of_the_base_does_not_depend_on_the_number_of_workers(
     flight: Path, tmp_path: Path
 ) -> None:
     for jobs in (0, 2):
@@ -161,7 +161,7 @@ def test_what_decides_does_not_depend_on_the_number_of_workers(
     assert table(tmp_path / "0") == table(tmp_path / "2")
 
 
-def test_where_frames_that_decided_have_changed_the_others_follow(
+def test_changed_deciding_frames_change_the_base_of_the_others(
     flight: Path, tmp_path: Path, bases: dict[str, ToneBase | None]
 ) -> None:
     copy = shutil.copytree(flight, tmp_path / "flight")
@@ -182,7 +182,7 @@ def test_where_frames_that_decided_have_changed_the_others_follow(
     assert table(tmp_path / "out") == table(tmp_path / "fresh")
 
 
-def test_where_the_base_does_not_matter_the_likelier_one_is_that_of_all(
+def test_the_likelier_base_is_used_for_all_if_the_choice_hardly_matters(
     flight: Path,
     tmp_path: Path,
     bases: dict[str, ToneBase | None],
@@ -199,7 +199,7 @@ def test_where_the_base_does_not_matter_the_likelier_one_is_that_of_all(
     assert (summary.tone_base, summary.measured_with_tone) == ("sRGB", ASKED)
 
 
-def test_the_base_is_added_to_what_is_known_of_a_target() -> None:
+def test_the_base_is_added_to_the_priors_of_a_target() -> None:
     rotation = SceneRotation((0.1, 0.0, 0.0), 0.01)
     target = TARGET_PLATE.target
     job = DetectionJob(Path(), CAMERA, None, (target,), DetectSettings(), tone_base=ToneBase.LINE)
@@ -209,7 +209,7 @@ def test_the_base_is_added_to_what_is_known_of_a_target() -> None:
     assert job.priors(unknown) == {target.name: PlatePrior(tone_base=ToneBase.LINE)}
 
 
-def test_a_second_look_is_over_the_same_base(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_look_uses_the_same_base(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     target, asked = TARGET_PLATE.target, []
 
     def look(*arguments: object) -> tuple[None, tuple[()]]:

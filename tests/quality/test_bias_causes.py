@@ -46,7 +46,7 @@ def errors(found: Regression, **truth: float) -> list[float]:
     return [(term.value - value) / term.sd for term, value in terms if term is not None]
 
 
-def test_injected_errors_come_back_within_their_deviations(fly: Fly) -> None:
+def test_injected_errors_are_recovered_within_their_deviations(fly: Fly) -> None:
     """0.1 % of focal length, 30 mm of lever arm, and all of δ with the one-edge method."""
     scaled = []
     for seed in SEEDS:
@@ -61,7 +61,7 @@ def test_injected_errors_come_back_within_their_deviations(fly: Fly) -> None:
     assert np.all(np.abs(np.mean(scaled, axis=0)) < 1.4)  # 3 deviations of a mean of five
 
 
-def test_with_both_edges_nothing_follows_the_exposure(fly: Fly) -> None:
+def test_distances_from_both_edges_do_not_depend_on_exposure(fly: Fly) -> None:
     scaled = []
     for seed in SEEDS:
         found = by(fly(seed, Method.MODEL, SCALE, OFFSET_M))
@@ -71,7 +71,7 @@ def test_with_both_edges_nothing_follows_the_exposure(fly: Fly) -> None:
     assert np.mean(np.abs(scaled) < 2.0) > 0.8
 
 
-def test_what_both_methods_say_of_one_and_two_edges_agrees(fly: Fly) -> None:
+def test_both_methods_give_the_same_coefficient_for_one_and_two_edges(fly: Fly) -> None:
     for edges, expected in ((1, 1.0), (2, 0.0)):
         for method in Method:
             shift = term_of(by(fly(3, method), edges), "edge_shift_px")
@@ -79,7 +79,7 @@ def test_what_both_methods_say_of_one_and_two_edges_agrees(fly: Fly) -> None:
             assert shift.value == pytest.approx(expected, abs=4.0 * shift.sd)
 
 
-def test_a_true_flight_has_no_significant_term(fly: Fly) -> None:
+def test_a_correct_flight_has_no_significant_term(fly: Fly) -> None:
     found = [by(fly(seed)) for seed in SEEDS]
     false = [term.name for one in found for term in one.terms if term.is_significant]
     assert len(false) <= 1  # at 1 % per flight
@@ -100,7 +100,7 @@ def plain(
     return DistanceResiduals(distance_m, 1000.0 / distance_m, residual_m, noise, missing | exposure)
 
 
-def test_errors_that_last_do_not_move_what_residuals_have_in_common() -> None:
+def test_lasting_errors_do_not_displace_the_systematic_part() -> None:
     rng = np.random.default_rng(0)
     n, span_s = 24, 30.0
     moved, scatter = 0.0, 0.0
@@ -119,7 +119,7 @@ def test_errors_that_last_do_not_move_what_residuals_have_in_common() -> None:
     assert scatter < 1.5
 
 
-def test_blur_of_curved_edges_is_told_from_scale_and_offset() -> None:
+def test_blur_of_curved_edges_is_separated_from_scale_and_offset() -> None:
     rng = np.random.default_rng(9)
     distance = np.exp(rng.uniform(2.3, 4.6, 300))
     residual = 0.5 * distance**3 / 1000.0**2 + 0.005 * rng.standard_normal(300)  # R: 1000 / D
@@ -131,7 +131,7 @@ def test_blur_of_curved_edges_is_told_from_scale_and_offset() -> None:
     assert found.exposure_terms == ()
 
 
-def test_of_quantities_that_look_alike_the_less_believed_is_given_up() -> None:
+def test_of_inseparable_quantities_the_later_one_is_left_out() -> None:
     rng = np.random.default_rng(3)
     distance = np.exp(rng.uniform(2.3, 4.6, 100))
     exposure = 0.001 * np.exp(rng.uniform(-1.0, 1.0, 100))
@@ -152,7 +152,7 @@ def test_of_quantities_that_look_alike_the_less_believed_is_given_up() -> None:
     assert found.exposure_probability < 1e-6
 
 
-def test_too_little_is_no_regression() -> None:
+def test_too_few_residuals_give_no_regression() -> None:
     distance = np.linspace(10.0, 100.0, 5)
     assert regress(plain(distance, 0.0 * distance, 0.01)) is None
     alike = 50.0 + 0.01 * np.arange(40.0)

@@ -127,7 +127,7 @@ def test_only_frames_that_must_show_the_whole_target_count() -> None:
     assert [study.trusts(one) for one in study.expected_visible] == [False, True]
 
 
-def test_what_is_not_where_it_must_be_is_misplaced() -> None:
+def test_measurements_away_from_the_expected_place_are_misplaced() -> None:
     attempts = [*_attempts()[:3], _attempt(3, 75.0, (400.0, 300.0))]
     study = study_bias(
         attempts, _nadir_poses(_ABOVE), _TARGET_POSITIONS, _CAMERA, [_TARGET], _METHOD
@@ -200,7 +200,7 @@ def test_nothing_to_compare_is_an_error_with_a_remedy() -> None:
         study_bias(_attempts(), renamed, _TARGET_POSITIONS, _CAMERA, [_TARGET], _METHOD)
 
 
-def test_errors_that_all_frames_share_stand_apart() -> None:
+def test_errors_common_to_all_frames_are_stated_separately() -> None:
     settings = VehicleSettings(sd_lever_arm_m=(0.0, 0.0, 0.02), sd_time_s=0.001)
     target_positions = TargetPositions.of("EPSG:25831", [_TARGET], _TRAJECTORY, settings)
     study = study_bias(
@@ -212,7 +212,7 @@ def test_errors_that_all_frames_share_stand_apart() -> None:
     assert sds.trajectory_m == pytest.approx(0.03, rel=1e-3)
 
 
-def test_of_a_static_target_all_of_its_place_is_shared() -> None:
+def test_the_position_error_of_a_static_target_is_common_to_all_frames() -> None:
     position = tuple(_TARGET_POSITIONS.local_frame.map_from_enu(np.zeros((1, 3)))[0].tolist())
     static = replace(_TARGET, position_m=position, sd_position_m=(0.01, 0.01, 0.05))
     target_positions = TargetPositions.of("EPSG:25831", [static], _TRAJECTORY, VehicleSettings())
@@ -226,7 +226,7 @@ def test_of_a_static_target_all_of_its_place_is_shared() -> None:
 
 
 @pytest.mark.parametrize("method", [Method.MODEL, Method.PAPER])
-def test_one_edge_is_displaced_and_two_are_not(method: Method) -> None:
+def test_distances_from_one_edge_are_displaced_and_from_two_are_not(method: Method) -> None:
     delta, radius, true_m = 0.4, 20.0, _ABOVE[0]
     displaced_m = true_m * radius / (radius - delta)  # a smaller ring seems farther away
     seen_px, seen_m = (radius, true_m) if method is Method.MODEL else (radius - delta, displaced_m)

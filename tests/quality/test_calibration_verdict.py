@@ -123,7 +123,7 @@ def test_a_rational_model_keeps_its_terms_small_on_a_field_with_errors(points: P
     assert set(result.undetermined) >= {"k1", "k4"}  # which can hardly be told apart
 
 
-def test_what_neglected_eccentricity_costs_is_what_an_adjustment_loses() -> None:
+def test_the_stated_effect_of_neglected_eccentricity_equals_that_of_an_adjustment() -> None:
     made = views(noise_px=0.0)
     told = change_if_neglected(calibrated(made))
     tiny = replace(FIELD, diameter_m=1e-5, marks=())  # whose centroids count as centres
@@ -153,7 +153,7 @@ def test_a_field_that_is_not_flat_is_noticed_and_estimated() -> None:
 
 
 @pytest.mark.parametrize("points", [PointModel.STIFF, PointModel.FREE])
-def test_a_sheet_that_bends_between_photographs_is_told_of_if_it_is_free(
+def test_a_sheet_that_bends_between_photographs_is_reported_if_it_is_free(
     points: PointModel,
 ) -> None:
     rng = np.random.default_rng(9)
@@ -193,7 +193,7 @@ def test_a_field_as_flat_as_it_is_stated_is_good() -> None:
 
 @pytest.mark.parametrize("points", [PointModel.STIFF, PointModel.FREE])
 @pytest.mark.parametrize(("grow", "ratio"), [(1.01, 0.0), (1.0, 5.0)])
-def test_a_bowed_sheet_is_told_by_its_heights_and_a_larger_one_is_not(
+def test_a_bowed_sheet_is_reported_and_a_larger_one_is_not(
     points: PointModel, grow: float, ratio: float
 ) -> None:
     """Photographs do not tell how large a field is."""
@@ -211,7 +211,7 @@ def test_a_bowed_sheet_is_told_by_its_heights_and_a_larger_one_is_not(
 
 
 @pytest.mark.parametrize(("stated_m", "is_told"), [(0.024, False), (0.0205, True)])
-def test_another_diameter_than_stated_is_told_and_does_no_harm(
+def test_a_wrong_stated_diameter_is_reported_and_does_no_harm(
     stated_m: float,
     is_told: bool,  # noqa: FBT001 - a parameter of the test
 ) -> None:
@@ -226,7 +226,7 @@ def test_another_diameter_than_stated_is_told_and_does_no_harm(
     assert abs(result.camera.fx - CAMERA.fx) < 3.0 * sd_px
 
 
-def test_a_larger_field_is_told_if_a_distance_was_measured() -> None:
+def test_a_larger_field_is_reported_if_a_distance_was_measured() -> None:
     larger = 0.01 * FIELD.points_m()
     names = FIELD.names()
     bar = FieldBar(names[0], names[-1], 1.01 * float(np.hypot(0.2, 0.16)), 0.00002)
@@ -265,7 +265,7 @@ def test_bars_that_contradict_each_other_are_named() -> None:
     assert re.search(r"the bar from r0c0 to r4c0 is \d\.\d+ mm shorter than", verdict.sentence)
 
 
-def test_bars_of_a_field_that_is_fixed_are_told_not_to_be_used() -> None:
+def test_unused_bars_of_a_fixed_field_are_reported() -> None:
     result = barred(1.005, points=PointModel.FIXED)
     verdict = judge(result, calibration_numbers(result))
     assert "the field is taken as stated, so that its bars are not used" in verdict.sentence
@@ -304,7 +304,7 @@ def test_a_photograph_of_another_zoom_takes_no_part(zoom: float, lens: LensModel
     assert any("Keep zoom, focus and crop" in sentence for sentence in verdict.advice)
 
 
-def test_a_photograph_of_another_zoom_is_told_where_another_one_fits_worst() -> None:
+def test_a_photograph_of_another_zoom_is_found_if_another_one_fits_worst() -> None:
     """Its pose and the camera take up so much that a right one has the largest residuals."""
     made = views(distance_m=0.45)
     made[4] = views(camera=replace(CAMERA, fx=1515.0, fy=1515.0), distance_m=0.45)[4]
@@ -313,7 +313,7 @@ def test_a_photograph_of_another_zoom_is_told_where_another_one_fits_worst() -> 
     assert abs(result.camera.fx - 1500.0) < 3.0 * calibration_numbers(result).sd[0] < 1.0
 
 
-def test_more_than_a_quarter_by_another_zoom_is_not_left_out_in_part() -> None:
+def test_more_than_a_quarter_of_another_zoom_is_not_partly_left_out() -> None:
     """Without three of these four, the others would fit well enough not to look bad."""
     other, made = replace(CAMERA, fx=1515.0, fy=1515.0), []
     for distance_m, wrong in ((0.45, (0, 1, 2)), (0.4, (2,))):
@@ -351,7 +351,7 @@ def test_photographs_whose_files_are_turned_by_half_a_turn_take_no_part() -> Non
     assert result.rms_px < 2.0 * result.operator_sd_px
 
 
-def test_of_two_halves_by_two_zooms_none_is_left_out() -> None:
+def test_with_two_halves_of_two_zooms_none_is_left_out() -> None:
     other = [replace(view, photo=f"{view.photo}b") for view in views(camera=OTHER_ZOOM)]
     result = calibrated(views() + other, PointModel.STIFF)
     assert result.dropped == ()
@@ -361,7 +361,7 @@ def test_of_two_halves_by_two_zooms_none_is_left_out() -> None:
     assert any("Keep zoom, focus and crop" in sentence for sentence in verdict.advice)
 
 
-def test_two_of_six_by_another_zoom_are_left_out_together() -> None:
+def test_two_of_six_photographs_of_another_zoom_are_left_out_together() -> None:
     """One after the other, the wrong one would go first."""
     made, by_other_zoom = views(), views(camera=OTHER_ZOOM)
     others = (0, 3)
@@ -376,7 +376,7 @@ def test_two_of_six_by_another_zoom_are_left_out_together() -> None:
 
 
 @pytest.mark.parametrize(("larger", "is_told"), [(1.15, True), (1.05, False)])
-def test_photographs_of_another_field_are_told_by_their_discs(
+def test_photographs_of_another_field_are_recognised_by_their_discs(
     larger: float, *, is_told: bool
 ) -> None:
     """Its pitch is taken for a distance: the camera is right, and nothing else shows it."""
@@ -394,18 +394,18 @@ def test_photographs_of_another_field_are_told_by_their_discs(
     assert (verdict.grade is CalibrationGrade.GOOD) != is_told
 
 
-def test_three_of_six_by_another_zoom_outvote_none() -> None:
+def test_three_of_six_photographs_of_another_zoom_exclude_none() -> None:
     result = calibrated(views()[:3] + views(camera=OTHER_ZOOM)[3:], PointModel.STIFF)
     assert result.dropped == ()
 
 
-def test_a_photograph_of_four_is_not_outvoted() -> None:
+def test_one_photograph_of_four_is_not_excluded() -> None:
     made = views()[:4]
     made[3] = views(camera=OTHER_ZOOM)[3]
     assert calibrated(made, PointModel.STIFF).dropped == ()
 
 
-def test_frontal_photographs_determine_little_and_say_so() -> None:
+def test_the_verdict_reports_that_frontal_photographs_determine_little() -> None:
     result = calibrated(views(tilt=0.005))
     verdict = judge(result, calibration_numbers(result))
     assert verdict.grade is CalibrationGrade.UNUSABLE
@@ -425,7 +425,7 @@ def test_the_principal_point_of_cropped_photographs_is_found_outside_them(cx: fl
 @pytest.mark.parametrize(
     ("cx", "border", "has_search"), [(2399.9, 1599.0, False), (-799.9, 0.0, True)]
 )
-def test_a_principal_point_that_runs_away_is_held_at_the_border_and_not_claimed(
+def test_a_diverging_principal_point_is_held_at_the_border_and_reported(
     cx: float, border: float, *, has_search: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No photograph stands apart, and to look for one takes the most time: once is enough."""
@@ -487,7 +487,7 @@ def test_a_displaced_disc_is_rejected_everywhere() -> None:
     assert result.camera.fx == pytest.approx(1500.0, abs=0.5)
 
 
-def test_discs_that_fit_in_no_photograph_are_named_and_not_placed() -> None:
+def test_discs_that_fit_in_no_photograph_are_named_and_left_out() -> None:
     made = []
     for view in views():
         vectors = view.vectors.copy()
@@ -520,7 +520,7 @@ def test_more_than_a_tenth_of_wrong_discs_make_it_unusable() -> None:
     assert "% of the discs do not fit" in verdict.sentence
 
 
-def test_a_fisheye_is_told() -> None:
+def test_a_fisheye_is_reported() -> None:
     """Rays by r = f θ, at up to 60° from the axis."""
     wide = Camera(1600, 1200, 500.0, 500.0, 811.0, 583.0)
     made = []
@@ -536,7 +536,7 @@ def test_a_fisheye_is_told() -> None:
     assert "fisheye" in verdict.sentence
 
 
-def test_negatives_are_to_be_checked() -> None:
+def test_negatives_are_reported_for_checking() -> None:
     result = calibrated(views(), lens=LensModel.AUTO)
     verdict = judge(result, calibration_numbers(result, DiscLight(0.07, 0.01, 0.0)))
     assert verdict.grade is CalibrationGrade.LOOK
@@ -564,14 +564,14 @@ def test_bursts_from_three_places_are_too_few() -> None:
     assert "6 photographs from 3 places only, fewer than 4" in verdict.sentence
 
 
-def test_one_photograph_three_times_is_no_traceback() -> None:
+def test_one_photograph_three_times_causes_no_traceback() -> None:
     once = views()[0]
     copies = [replace(once, photo=f"copy{index}") for index in range(3)]
     with pytest.raises(KgcpError, match="the photographs do not determine a camera"):
         calibrated(copies, PointModel.STIFF)
 
 
-def test_a_field_that_is_never_tilted_is_no_traceback() -> None:
+def test_a_field_that_is_never_tilted_causes_no_traceback() -> None:
     straight = [replace(view, covs=1e-4 * view.covs) for view in views(0.0, noise_px=0.01 * SD_PX)]
     with pytest.raises(KgcpError, match="tilt the field by 25° to 40°"):
         calibrated(straight)

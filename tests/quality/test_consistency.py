@@ -217,7 +217,7 @@ _INJECTED = {
 
 
 @pytest.mark.parametrize("name", _INJECTED)
-def test_what_is_injected_comes_back_within_its_sigma_and_nothing_else_does(name: str) -> None:
+def test_only_injected_errors_are_found_within_their_deviations(name: str) -> None:
     flight, value = _INJECTED[name]
     truth = np.array([value if unknown.name == name else 0.0 for unknown in UNKNOWNS])
     found = [replace(flight, seed=seed).study() for seed in range(5)]
@@ -245,7 +245,7 @@ def test_scatter_over_flights_is_the_reported_sigma() -> None:
     assert np.abs(standardised.mean(axis=0)).max() < 0.8
 
 
-def test_at_constant_speed_straight_on_time_and_lever_arm_are_not_told_apart() -> None:
+def test_a_straight_drive_at_constant_speed_does_not_separate_time_and_lever_arm() -> None:
     found = Flight(is_straight=True, time_offset_s=0.025, seed=3).study()
     by_name = {one.name: one for one in found.estimate.corrections}
     time, forward = by_name["time_offset_s"], by_name["lever_arm_forward_m"]
@@ -259,7 +259,7 @@ def test_at_constant_speed_straight_on_time_and_lever_arm_are_not_told_apart() -
     assert any("apart from lever_arm_forward_m" in line for line in advice(found))
 
 
-def test_advice_names_key_and_amount_and_heeding_it_ends_it() -> None:
+def test_advice_names_key_and_amount_and_disappears_once_followed() -> None:
     flight = Flight(time_offset_s=0.025, seed=1)
     (line,) = advice(flight.study())
     match = re.fullmatch(
@@ -271,7 +271,7 @@ def test_advice_names_key_and_amount_and_heeding_it_ends_it() -> None:
     assert advice(Flight(seed=1).study()) == ()
 
 
-def test_what_flight_toml_itself_calls_uncertain_needs_no_correction() -> None:
+def test_corrections_within_the_uncertainty_in_flight_toml_are_not_advised() -> None:
     """8 cm are found just as well, but within 10 cm nobody has claimed anything else."""
     flight = Flight(lever_m=_LEVER + _TO_THE_RIGHT, seed=1)
     for sd_m, lines in ((0.05, 1), (0.1, 0)):
@@ -299,7 +299,7 @@ def test_a_correct_flight_has_no_cause_to_look_for() -> None:
         assert Flight(seed=seed, has_sds=False).causes() == ()
 
 
-def test_a_lever_arm_of_the_wrong_sign_is_told_from_one_of_the_wrong_length() -> None:
+def test_a_wrong_sign_of_a_lever_arm_is_distinguished_from_a_wrong_length() -> None:
     right = VehicleSettings(lever_arm_m=(*_LEVER[:2].tolist(), -float(_LEVER[2])))
     (doubt,) = Flight(seed=2, settings=right).causes()
     assert doubt.code is Cause.LEVER_ARM
@@ -330,7 +330,7 @@ def test_offsets_are_along_and_across_the_track() -> None:
     assert 0.7 < np.sqrt(np.mean(deviations**2)) < 1.2
 
 
-def test_wrong_points_are_named_and_take_no_part() -> None:
+def test_wrong_points_are_named_as_outliers_and_left_out() -> None:
     found = Flight(seed=5, time_offset_s=0.025, wrong=(7, 30, 31, 90)).study()
     assert [i for i, one in enumerate(found.discrepancies) if one.is_outlier] == [7, 30, 31, 90]
     time = found.estimate.corrections[0]
@@ -344,7 +344,7 @@ def test_the_trajectorys_correlation_time_is_found_to_within_its_neighbours() ->
     assert set(times) <= {10.0, 30.0}  # 20 s, of 0, 1, 3, 10, 30, 100, 300
 
 
-def test_without_deviations_the_residuals_set_the_scale() -> None:
+def test_without_stated_deviations_the_residuals_determine_the_scale() -> None:
     flight = Flight(has_sds=False, time_offset_s=0.025)
     truth = np.array([0.025, *[0.0] * 7])
     tables = np.array([_corrections(replace(flight, seed=k).study()) for k in range(6)])

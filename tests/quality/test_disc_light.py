@@ -36,13 +36,13 @@ def test_light_changes_bright_levels_most() -> None:
     assert found.doubt == ""
 
 
-def test_reflections_that_add_alike_everywhere_are_no_doubt() -> None:
+def test_uniform_reflections_raise_no_doubt() -> None:
     glare = 0.2 * light(0.9)
     assert of_levels(0.05 + glare, 0.6 + glare).doubt == ""
 
 
 @pytest.mark.parametrize("is_bright", [False, True])
-def test_negatives_are_told_whatever_the_discs(*, is_bright: bool) -> None:
+def test_negatives_are_recognised_with_any_discs(*, is_bright: bool) -> None:
     levels = (1.0 - 0.1 * light(0.6), 1.0 - 0.8 * light(0.6))
     found = of_levels(*(levels if is_bright else levels[::-1]))
     assert "they look like negatives" in found.doubt
@@ -55,7 +55,7 @@ def test_burnt_white_may_be_the_cause(clipped: float) -> None:
     assert "white is burnt, or they are negatives" in found.doubt
 
 
-def test_single_burnt_photographs_are_no_doubt() -> None:
+def test_single_burnt_photographs_raise_no_doubt() -> None:
     """Where white is burnt, discs may be fitted without their ink: its level is anything."""
     levels = np.column_stack((0.2 * light(0.3), 0.8 * light(0.3)))
     burnt = np.column_stack((0.2 + 0.5 * light(0.9), np.ones(len(PLACES_PX))))
@@ -65,7 +65,7 @@ def test_single_burnt_photographs_are_no_doubt() -> None:
     assert "burnt" in light_on_discs([(PLACES_PX, burnt, clipped + 0.5)] * 2).doubt
 
 
-def test_negatives_are_told_if_the_light_falls_off_over_some_of_them() -> None:
+def test_negatives_are_recognised_if_light_falls_off_in_some_photographs() -> None:
     def negative(fall: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         levels = np.column_stack((1.0 - 0.8 * light(fall), 1.0 - 0.1 * light(fall)))
         return PLACES_PX, levels, np.zeros(len(PLACES_PX))
@@ -75,7 +75,7 @@ def test_negatives_are_told_if_the_light_falls_off_over_some_of_them() -> None:
     )
 
 
-def test_even_light_says_nothing() -> None:
+def test_even_light_raises_no_doubt() -> None:
     assert of_levels(1.0 - 0.1 * light(0.05), 1.0 - 0.8 * light(0.05)).doubt == ""
 
 
@@ -86,7 +86,7 @@ def test_single_levels_that_are_off_do_not_count() -> None:
     assert of_levels(dark, 0.8 * light(0.2)).dark < 0.015
 
 
-def test_the_negative_of_a_photograph_is_told() -> None:
+def test_the_negative_of_a_photograph_is_recognised() -> None:
     marks = (Mark(1, 1, 0.013, 0.006),)
     field = Field("board", GridKind.SQUARE, 7, 5, 0.024, 0.013, marks=marks)
     camera = Camera(800, 600, 1000.0, 1000.0, 404.0, 297.0, -0.1)

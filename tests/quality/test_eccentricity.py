@@ -17,13 +17,13 @@ from kgcp.quality.eccentricity import (
 CAMERA = Camera(1200, 800, 1500.0, 1500.0, 590.0, 410.0, -0.2)
 
 
-def test_over_the_angle_it_follows_the_formula() -> None:
+def test_eccentricity_over_the_angle_follows_the_formula() -> None:
     angles_deg, px = eccentricity_over_angle(CAMERA, 20.0)
     expected = 20.0**2 / 1500.0 * 0.5 * np.sin(np.radians(2.0 * angles_deg))
     assert px == pytest.approx(expected, abs=2e-3 * expected.max())
 
 
-def test_within_the_marker_it_grows_with_the_square_of_the_radius() -> None:
+def test_distortion_within_the_marker_grows_with_the_square_of_the_radius() -> None:
     """And towards the corners: it is the curvature of the distortion, times R²."""
     places, small = displacement_over_frame(CAMERA, 10.0)
     _, large = displacement_over_frame(CAMERA, 20.0)
@@ -36,7 +36,7 @@ def test_within_the_marker_it_grows_with_the_square_of_the_radius() -> None:
     ] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_summary_of_a_view() -> None:
+def test_the_summary_of_a_view_has_medians_and_largest_values() -> None:
     tilt = np.radians(30.0)
     centres = np.array([[0.0, 0.0, 1.0], [0.2, 0.1, 1.0]])
     normals = np.array([[np.sin(tilt), 0.0, np.cos(tilt)], [0.0, 0.0, 1.0]])
@@ -50,7 +50,7 @@ def test_summary_of_a_view() -> None:
     assert 0.0 < summary.in_marker_px.median < summary.in_marker_px.largest < 0.05
 
 
-def test_neglected_shifts_change_what_they_look_like() -> None:
+def test_neglected_shifts_change_the_parameters_that_imitate_them() -> None:
     rng = np.random.default_rng(0)
     jacobian, weights = rng.normal(size=(40, 3)) * [1.0, 1e4, 1e-3], rng.uniform(1.0, 2.0, 40)
     change = np.array([0.1, -2e-5, 30.0])

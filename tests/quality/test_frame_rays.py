@@ -25,12 +25,12 @@ def test_a_longer_lens_moves_rays_outwards() -> None:
     assert difference.largest_px == pytest.approx(1.0, abs=0.05)
 
 
-def test_a_turn_takes_most_of_a_shift_of_the_principal_point_away() -> None:
+def test_a_rotation_absorbs_most_of_a_shift_of_the_principal_point() -> None:
     difference = compare_cameras(CAMERA, replace(CAMERA, cx=808.0))
     assert 0.05 < difference.rms_px < 0.6
 
 
-def test_deviations_are_the_differences_that_they_foretell() -> None:
+def test_ray_deviations_equal_the_differences_of_a_changed_parameter() -> None:
     """One parameter is uncertain: rays move as they do for a camera with another value of it."""
     cov = CalibrationCovariance.of(("k1",), np.array([[0.001**2]]))
     foretold = ray_deviations_px(CAMERA, cov).ravel()

@@ -70,7 +70,7 @@ def first_of(result: FrameResult) -> Measurement:
     return outcome
 
 
-def test_the_base_that_most_of_the_likelihood_speaks_for_is_that_of_all() -> None:
+def test_the_base_with_most_of_the_likelihood_is_used_for_all() -> None:
     results = [frame(f"f{k}", SRGB, 20.0 + k) for k in range(5)] + [frame("odd", LINE, 12.0)]
     learnt = learn_imaging(results)
     assert learnt is not None
@@ -92,7 +92,7 @@ def test_one_frame_alone_never_decides(against: list[float]) -> None:
     assert learnt.base is SRGB
 
 
-def test_where_frames_disagree_each_keeps_its_own() -> None:
+def test_if_frames_disagree_each_keeps_its_own_base() -> None:
     results = [frame(f"f{k}", SRGB if k % 2 else LINE, 25.0) for k in range(7)]
     learnt = learn_imaging(results)
     assert learnt is not None
@@ -104,7 +104,7 @@ def test_where_frames_disagree_each_keeps_its_own() -> None:
     ("clear", "against", "base"),
     [(5, 0.0, LINE), (4, 0.0, None), (5, 29.0, LINE), (5, 31.0, None), (9, 60.0, None)],
 )
-def test_some_frames_decide_only_where_they_say_it_clearly(
+def test_the_first_frames_decide_only_if_they_are_clear(
     clear: int, against: float, base: ToneBase | None
 ) -> None:
     results = [frame(f"f{k}", LINE, 1e3) for k in range(clear)]
@@ -112,7 +112,7 @@ def test_some_frames_decide_only_where_they_say_it_clearly(
     assert clearly_agreed_base(results) is base
 
 
-def test_the_plates_of_one_frame_count_as_one() -> None:
+def test_several_plates_of_one_frame_count_once() -> None:
     (plate, _) = frame("a", LINE, 1e3).outcomes
     assert isinstance(plate, Measurement)
     plates = tuple(replace(plate, instance=k) for k in range(9))
@@ -135,7 +135,7 @@ def test_a_frame_that_is_far_from_the_base_of_the_others_keeps_its_own() -> None
 @pytest.mark.parametrize(
     ("frames", "alike", "base"), [(12, 10, SRGB), (12, 9, None), (11, 11, None)]
 )
-def test_the_base_does_not_matter_where_nearly_all_distances_are_alike(
+def test_the_choice_of_the_base_hardly_matters_if_most_distances_agree(
     frames: int, alike: int, base: ToneBase | None
 ) -> None:
     results = [frame(f"f{k}", SRGB if k % 3 else LINE, 2.0) for k in range(frames)]

@@ -58,7 +58,7 @@ def test_deviations_are_those_of_the_scatter_where_errors_last() -> None:
     assert np.mean(np.abs(errors) < 2.0) > 0.88
 
 
-def test_lasting_errors_are_told_from_others() -> None:
+def test_lasting_errors_are_distinguished_from_independent_ones() -> None:
     rng = np.random.default_rng(7)
     time_s = np.arange(300.0)
     one, ones = np.ones((300, 1)), np.ones(300)
@@ -95,7 +95,7 @@ def test_the_weighting_is_that_of_the_full_covariance(dimension: int, tau_s: flo
         np.testing.assert_array_equal(whitened_products(columns, scalars, tau_s)[0], products)
 
 
-def test_of_unknowns_that_look_alike_the_last_is_given_up() -> None:
+def test_of_inseparable_unknowns_the_last_is_left_out() -> None:
     rng = np.random.default_rng(11)
     design = rng.normal(size=(50, 4))
     design[:, 2] = design[:, 0] - 2.0 * design[:, 1] + 1e-4 * rng.normal(size=50)
@@ -106,7 +106,7 @@ def test_of_unknowns_that_look_alike_the_last_is_given_up() -> None:
     assert separable_unknowns(design.T @ design, range(4), [1e12] * 4) == ([0, 1, 2, 3], [])
 
 
-def test_outliers_do_not_decide() -> None:
+def test_outliers_do_not_change_the_fit() -> None:
     rng = np.random.default_rng(5)
     x = np.linspace(10.0, 100.0, 60)
     observed = 0.02 + 0.001 * x + 0.003 * rng.standard_normal(60)
@@ -146,7 +146,7 @@ def test_holm_lies_between_the_single_test_and_bonferroni(probabilities: list[fl
                 assert corrected[i] <= corrected[j]
 
 
-def test_holm_and_student_as_in_tables() -> None:
+def test_holm_and_student_agree_with_published_tables() -> None:
     assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
     assert two_sided_probability(2.228, 10) == pytest.approx(0.05, abs=1e-4)
     assert two_sided_probability(-3.169, 10) == pytest.approx(0.01, abs=1e-4)

@@ -80,7 +80,7 @@ def test_positions_and_prints_as_good_as_stated_raise_no_doubt(seed: int) -> Non
     assert check(seen(flight, printed), stated(flight, SD_M * rng.standard_normal((4, 3)))) == ()
 
 
-def test_prints_that_are_all_wrong_alike_raise_no_doubt_up_to_two_percent() -> None:
+def test_a_common_error_of_prints_up_to_two_percent_raises_no_doubt() -> None:
     for permille in (-15.0, 15.0):
         flight = GroundFlight(stated_diameter_m=0.9 * (1.0 + 1e-3 * permille))
         assert check(seen(flight), stated(flight)) == ()
@@ -91,7 +91,7 @@ def test_prints_that_are_all_wrong_alike_raise_no_doubt_up_to_two_percent() -> N
 
 
 @pytest.mark.parametrize("off_m", [0.3, 3.0])
-def test_a_position_that_is_wrong_is_told_with_its_target(off_m: float) -> None:
+def test_a_wrong_position_is_reported_with_its_target(off_m: float) -> None:
     flight = GroundFlight()
     (doubt,) = check(seen(flight), stated(flight, np.outer([0, 1, 0, 0], [off_m, 0.0, 0.0])))
     assert doubt.code is Cause.STATIC_TARGETS
@@ -101,7 +101,7 @@ def test_a_position_that_is_wrong_is_told_with_its_target(off_m: float) -> None:
     assert 0.6 * off_m < abs(doubt.figures["off_m"]) < 1.1 * off_m
 
 
-def test_prints_that_are_stated_as_less_certain_are_allowed_for() -> None:
+def test_stated_larger_deviations_of_prints_are_allowed_for() -> None:
     flight = GroundFlight()
 
     def larger(_: int, name: str, pose: Pose) -> tuple[str, Pose]:
@@ -114,7 +114,7 @@ def test_prints_that_are_stated_as_less_certain_are_allowed_for() -> None:
     assert check(known, stated(flight)) == ()
 
 
-def test_names_that_are_exchanged_are_told() -> None:
+def test_exchanged_names_are_reported() -> None:
     offsets_m = np.vstack((GroundFlight().offsets_m, [[0.5, 1.0, 0.0]]))
     flight = GroundFlight(names=("A", "B", "C", "D", "E"), offsets_m=offsets_m)
     other = {"A": "E", "E": "A"}
@@ -124,7 +124,7 @@ def test_names_that_are_exchanged_are_told() -> None:
     assert "A and E contradict most others" in doubt.sentence
 
 
-def test_a_target_that_was_moved_is_told() -> None:
+def test_a_moved_target_is_reported() -> None:
     flight = GroundFlight()
 
     def moved(row: int, name: str, pose: Pose) -> tuple[str, Pose]:
@@ -136,7 +136,7 @@ def test_a_target_that_was_moved_is_told() -> None:
     assert "C contradicts most others" in doubt.sentence
 
 
-def test_another_target_in_a_single_frame_is_told_with_the_frame() -> None:
+def test_another_target_in_a_single_frame_is_reported_with_the_frame() -> None:
     flight = GroundFlight()
 
     def taken(row: int, name: str, pose: Pose) -> tuple[str, Pose]:
@@ -176,7 +176,7 @@ def test_one_wrong_position_of_three_is_no_factor_of_all_distances(wrong: int) -
 
 @pytest.mark.parametrize("count", [2, 3, 4])
 @pytest.mark.parametrize("is_common", [False, True])
-def test_prints_and_focal_lengths_off_by_permille_are_no_doubt(
+def test_prints_and_focal_lengths_off_by_permille_raise_no_doubt(
     count: int, *, is_common: bool
 ) -> None:
     offsets_m = GroundFlight().offsets_m[:count]
@@ -195,7 +195,7 @@ def test_prints_and_focal_lengths_off_by_permille_are_no_doubt(
         assert check(seen(flight, printed), positions) == ()
 
 
-def test_rows_that_are_read_one_after_the_other_distort_distances() -> None:
+def test_distortions_by_a_rolling_shutter_raise_no_doubt() -> None:
     flight = GroundFlight()
     rolling = replace(CAMERA, readout_s=0.1)
 
@@ -212,7 +212,7 @@ def test_rows_that_are_read_one_after_the_other_distort_distances() -> None:
 
 
 @pytest.mark.parametrize(("off_m", "is_told"), [(0.009, False), (0.018, True)])
-def test_millimetres_between_neighbours_are_no_contradiction(
+def test_millimetres_between_neighbours_raise_no_doubt(
     off_m: float,
     is_told: bool,  # noqa: FBT001 - a parameter of the test
 ) -> None:
@@ -232,7 +232,7 @@ def test_millimetres_between_neighbours_are_no_contradiction(
 
 
 @pytest.mark.parametrize(("factor", "is_told"), [(1.0, False), (10.0, True)])
-def test_places_in_frames_scatter_as_they_state(
+def test_scatter_beyond_the_stated_deviations_is_reported(
     factor: float,
     is_told: bool,  # noqa: FBT001 - a parameter of the test
 ) -> None:
@@ -247,7 +247,9 @@ def test_places_in_frames_scatter_as_they_state(
 
 
 @pytest.mark.parametrize(("frames", "cause"), [(2, Cause.SINGLE_FRAMES), (4, Cause.STATIC_TARGETS)])
-def test_a_target_elsewhere_in_few_frames_is_their_matter(frames: int, cause: Cause) -> None:
+def test_a_target_elsewhere_in_few_frames_is_a_fault_of_the_frames(
+    frames: int, cause: Cause
+) -> None:
     """Of twelve frames."""
     flight = GroundFlight()
 
@@ -259,12 +261,12 @@ def test_a_target_elsewhere_in_few_frames_is_their_matter(frames: int, cause: Ca
     assert doubt.code is cause
 
 
-def test_frames_with_one_target_tell_nothing() -> None:
+def test_frames_with_one_target_raise_no_doubt() -> None:
     flight = GroundFlight(names=("A",), offsets_m=GroundFlight().offsets_m[:1])
     assert check(seen(flight), stated(flight)) == ()
 
 
-def test_positions_that_are_stated_as_less_certain_are_allowed_for() -> None:
+def test_stated_larger_deviations_of_positions_are_allowed_for() -> None:
     flight, off_m = GroundFlight(), np.outer([0, 1, 0, 0], [0.4, 0.0, 0.0])
     unsure = {
         name: TargetPosition(place.position_m, 0.1**2 * np.eye(3))
@@ -274,7 +276,7 @@ def test_positions_that_are_stated_as_less_certain_are_allowed_for() -> None:
     assert check(seen(flight), unsure) == ()
 
 
-def test_another_plate_of_the_same_code_is_passed_over() -> None:
+def test_another_plate_with_the_same_code_is_ignored() -> None:
     flight = GroundFlight()
     sightings = seen(flight)
     others = [
@@ -285,7 +287,7 @@ def test_another_plate_of_the_same_code_is_passed_over() -> None:
     assert check([*sightings, *others], stated(flight)) == ()
 
 
-def test_one_of_three_frames_is_no_wrong_position() -> None:
+def test_a_contradiction_in_one_of_three_frames_is_no_wrong_position() -> None:
     flight = GroundFlight(frames=3)
 
     def taken(row: int, name: str, pose: Pose) -> tuple[str, Pose]:

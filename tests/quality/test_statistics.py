@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from kgcp.quality.statistics import Spread, moving_statistics, wilson_interval
 
 
-def test_spread_of_known_numbers() -> None:
+def test_the_spread_of_known_numbers_is_right() -> None:
     spread = Spread.of(np.array([1.0, 2.0, 3.0, 6.0]))
     assert (spread.count, spread.mean) == (4, 3.0)
     assert spread.sd == pytest.approx(math.sqrt(14.0 / 3.0))
@@ -29,7 +29,7 @@ def test_spread_of_known_numbers() -> None:
         (1807, 2134, 0.8309, 0.8614),  # the paper's 84.7 %
     ],
 )
-def test_wilson_intervals_of_the_literature(
+def test_wilson_intervals_agree_with_published_ones(
     successes: int, trials: int, low: float, high: float
 ) -> None:
     assert wilson_interval(successes, trials) == pytest.approx((low, high), abs=1e-3)
@@ -46,7 +46,7 @@ def test_wilson_intervals_solve_their_equation(case: tuple[int, int]) -> None:
             assert (rate - end) ** 2 == pytest.approx(1.96**2 * end * (1 - end) / trials, rel=1e-3)
 
 
-def test_wilson_refuses_nonsense() -> None:
+def test_wilson_intervals_refuse_impossible_counts() -> None:
     with pytest.raises(ValueError, match="3 successes in 2 trials"):
         wilson_interval(3, 2)
 

@@ -94,7 +94,7 @@ def test_reasons_are_counted_and_in_words(tmp_path: Path) -> None:
     assert 'data-reason="too_small"' in page, "the table's word, for those who look it up"
 
 
-def test_the_page_comes_last_and_goes_first(tmp_path: Path) -> None:
+def test_the_page_is_written_last_and_removed_first(tmp_path: Path) -> None:
     write(tmp_path)
     sheet = ContactSheet(tmp_path)
     assert sheet.page.is_file(), "until there is something new, the old one holds"

@@ -15,7 +15,7 @@ print(matplotlib.rcParams["figure.dpi"])
 """
 
 
-def test_a_flight_s_folder_does_not_set_how_figures_look(tmp_path: Path) -> None:
+def test_plot_settings_in_a_flight_s_folder_are_ignored(tmp_path: Path) -> None:
     (tmp_path / "matplotlibrc").write_bytes(b"figure.dpi: 7\n\xff\n")
     ran = subprocess.run(
         [sys.executable, "-c", _PROGRAM], cwd=tmp_path, capture_output=True, text=True, check=True

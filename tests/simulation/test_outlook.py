@@ -117,7 +117,7 @@ def test_speed_and_diameter_are_simple_geometry(outlooks: tuple[Outlook, ...]) -
     assert enough.sd_distance_m == pytest.approx(0.0001 * 37.0, rel=0.02)
 
 
-def test_replicas_serve_where_the_ring_is_cut(outlooks: tuple[Outlook, ...]) -> None:
+def test_replicas_are_used_where_the_ring_is_cut(outlooks: tuple[Outlook, ...]) -> None:
     close, too_close, far = outlooks[2:]
     assert close.ring == "A-inner"
     assert close.radius_px == pytest.approx(0.09 * 1001.0 / 3.0)
@@ -125,7 +125,7 @@ def test_replicas_serve_where_the_ring_is_cut(outlooks: tuple[Outlook, ...]) -> 
     assert (far.ring, far.found, far.sd_centre_px) == ("A", 0.0, None)
 
 
-def test_chances_are_those_of_the_benchmark() -> None:
+def test_chances_of_detection_are_those_of_the_benchmark() -> None:
     assert chance_to_find(5.9) == (0.0, 0.0, 0.0)
     share, low, high = chance_to_find(6.5)
     assert share == FOUND[0][1] / FOUND[0][2]
@@ -134,7 +134,7 @@ def test_chances_are_those_of_the_benchmark() -> None:
     assert 0.98 < chance_to_find(400.0)[1] < 0.99  # Wilson: 300 of 300
 
 
-def test_usual_heights_are_round_and_of_use() -> None:
+def test_default_heights_are_round_and_useful() -> None:
     heights = usual_heights(CAMERA, TARGET)
     assert heights == (2.0, 3.0, 5.0, 7.0, 10.0, 15.0, 20.0, 30.0, 50.0, 70.0)
     assert 0.09 * 1001.0 / heights[0] <= LARGEST_SHARE * 120
@@ -170,7 +170,7 @@ def test_impossible_heights_are_refused(heights_m: tuple[float, ...]) -> None:
         (0.1, (0.4, 0.02), 20.0),  # a hole of 1 px
     ],
 )
-def test_circles_of_the_smallest_plain_target_are_told_apart(
+def test_circles_of_the_smallest_plain_target_can_be_separated(
     border_m: float | None, diameters_m: tuple[float, ...], least_px: float
 ) -> None:
     position_m = (0.0, 0.0, 0.0)

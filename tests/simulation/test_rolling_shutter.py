@@ -52,7 +52,7 @@ def test_rows_are_displaced_by_rate_times_time() -> None:
     assert_allclose(rolled.sum(axis=1)[inner], 17.0, atol=1e-7)
 
 
-def test_edges_along_the_rows_are_met_at_their_rows_moment() -> None:
+def test_edges_along_the_rows_are_displaced_by_their_row_s_delay() -> None:
     motion = RowMotion((0.0, 0.01), 240.0, 480)
     image = scene(rectangle((0.0, 5.0), 200.0, 40.0), 4)  # y from −15 to 25 about the centre
     rolled = Optics(0.7, motion=motion).spread(image, 4, WINDOW.row)[:, 40]

@@ -57,7 +57,7 @@ def test_distance_is_that_of_all_rotations(m: int, n: int, mirrored: bool, seed:
     assert dots_apart(first, second, mirrored=mirrored) == pytest.approx(brute, abs=0.15)
 
 
-def test_turned_and_mirrored_codes_are_no_distance_away() -> None:
+def test_rotated_and_mirrored_codes_have_distance_zero() -> None:
     code = ring(0, 43, 78, 180)
     assert dots_apart(code, ring(10, 53, 88, 190)) == pytest.approx(0.0, abs=1e-9)
     mirror = ring(0, 180, 282, 317)
@@ -66,7 +66,7 @@ def test_turned_and_mirrored_codes_are_no_distance_away() -> None:
     assert dots_apart(code, ring(0, 43, 78, 180, 260)) == pytest.approx(1.0)
 
 
-def test_what_looks_the_same_when_turned_is_near_itself() -> None:
+def test_symmetric_codes_are_near_to_themselves() -> None:
     assert dots_apart_turned(ring(0, 180)) == pytest.approx(0.0, abs=1e-9)
     # A half turn lays 0 and 180 onto each other, and nothing else.
     assert dots_apart_turned(ring(0, 43, 78, 180)) == pytest.approx(4.0)

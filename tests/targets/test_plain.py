@@ -45,7 +45,7 @@ def test_normal_becomes_a_unit_vector() -> None:
         ({"sd_diameter_m": -0.1}, "sd_diameter_m"),
     ],
 )
-def test_refuses_what_cannot_be(changes: dict[str, Any], key: str) -> None:
+def test_impossible_targets_are_refused(changes: dict[str, Any], key: str) -> None:
     with pytest.raises(SettingError) as caught:
         plain(**changes)
     assert caught.value.key == key

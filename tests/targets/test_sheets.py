@@ -80,7 +80,7 @@ def test_the_rings_are_those_of_flight_toml() -> None:
     )  # clockwise: y down
 
 
-def test_one_sheet_is_turned_where_that_helps() -> None:
+def test_a_single_sheet_is_turned_if_it_then_fits() -> None:
     wide = draw_target(SMALL, None)
     (upright,) = lay_out(wide, "x", Paper.A4, is_tiled=False)
     assert (upright.width_mm, upright.height_mm) == (210.0, 297.0)
@@ -162,7 +162,7 @@ def test_the_arrow_is_on_the_plate_and_outside_the_white(
     assert left[1] - apex[1] > 10.0, "it can be seen"
 
 
-def test_a_ruler_is_as_long_as_it_says() -> None:
+def test_the_ruler_has_the_stated_length() -> None:
     shapes = draw_target(SMALL, None).shapes
     bars = [
         s for s in shapes if isinstance(s, Polyline) and not s.is_filled and s.layer is Layer.RULER
@@ -177,7 +177,7 @@ def test_a_ruler_is_as_long_as_it_says() -> None:
     assert (wide, high) == (100.0, 50.0)
 
 
-def test_impossible_sheets_say_what_helps() -> None:
+def test_impossible_sheets_are_refused_with_a_remedy() -> None:
     artwork = draw_target(LARGE, None)
     with pytest.raises(SettingError, match=r"1145 × \d+ mm, A4 is smaller; allow several sheets"):
         lay_out(artwork, "A", Paper.A4, is_tiled=False)
@@ -216,7 +216,9 @@ def test_new_targets_have_the_proportions_of_the_first() -> None:
         (["0,43,78,180"], None, "diameter: is missing"),
     ],
 )
-def test_new_codes_that_cannot_be(codes: list[str], diameter_m: float | None, words: str) -> None:
+def test_impossible_new_codes_are_refused(
+    codes: list[str], diameter_m: float | None, words: str
+) -> None:
     with pytest.raises(SettingError, match=words):
         new_targets([], diameter_m, codes, 0, 4)
 

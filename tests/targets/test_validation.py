@@ -21,7 +21,7 @@ def ring(name: str = "A", code: tuple[float, ...] = CODE, size_m: float = 0.9) -
     turn_deg=st.floats(-360.0, 360.0),
     jitter_deg=st.lists(st.floats(-5.0, 5.0), min_size=4, max_size=4),
 )
-def test_a_turned_code_coincides_however_the_dots_are_counted(
+def test_a_rotated_code_coincides_from_any_starting_dot(
     turn_deg: float, jitter_deg: list[float]
 ) -> None:
     turned = np.mod(np.add(CODE, jitter_deg) + turn_deg, 360.0)
@@ -31,17 +31,17 @@ def test_a_turned_code_coincides_however_the_dots_are_counted(
 @pytest.mark.parametrize(
     "code", [OTHER_CODE, (0.0, 43.0, 78.0, 220.0), (0.0, 102.0, 137.0, 180.0), (0.0, 43.0, 78.0)]
 )
-def test_other_codes_and_mirrored_ones_do_not(code: tuple[float, ...]) -> None:
+def test_other_and_mirrored_codes_do_not_coincide(code: tuple[float, ...]) -> None:
     assert not codes_coincide(ring(), ring("B", code))
 
 
-def test_shape_is_what_remains_without_size() -> None:
+def test_shape_does_not_depend_on_size() -> None:
     assert same_shape(ring(), ring("B", size_m=0.18))
     assert not same_shape(ring(), Ring("B", 0.9, 0.3, 0.6, 0.12, CODE))
 
 
 @pytest.mark.parametrize(("inner_m", "is_same"), [(0.553, True), (0.559, False)])
-def test_shape_is_compared_alike_in_both_directions(inner_m: float, *, is_same: bool) -> None:
+def test_comparing_shapes_is_symmetric(inner_m: float, *, is_same: bool) -> None:
     narrow = Ring("A", 1.0, 0.5, 0.72, 0.1, CODE)
     wide = Ring("B", 1.0, inner_m, 0.72, 0.1, CODE)
     assert same_shape(narrow, wide) is same_shape(wide, narrow) is is_same
@@ -54,7 +54,7 @@ def test_a_replica_with_the_code_of_its_plate_is_refused() -> None:
         check_targets([Target(plate, (plate.scaled("A-inner", 0.2, turned),))])
 
 
-def test_equal_codes_on_rings_of_other_shape_are_told_apart() -> None:
+def test_equal_codes_on_rings_of_different_shape_are_allowed() -> None:
     check_targets([Target(ring()), Target(Ring("B", 0.9, 0.3, 0.6, 0.12, CODE))])
 
 

@@ -141,7 +141,7 @@ def test_mmvii_distances_name_image_and_point(points: MapPoints) -> None:
         assert float(cells[4]) == pytest.approx(point.sd_distance_m, abs=1e-9)
 
 
-def test_mmvii_knows_the_frame_of_its_points(points: MapPoints) -> None:
+def test_mmvii_gets_the_coordinate_frame_of_its_points(points: MapPoints) -> None:
     """By cSysCo.cpp: RTL*x*y*z*CRS, in PROJ's order of axes, is east, north, up over that point."""
     texts = mmvii.files(points)
     definition = _bare(_mmvii_data(texts["mmvii/CurSysCo.xml"], "SysCoData"), "Def")
@@ -207,7 +207,7 @@ def test_points_without_deviations_are_refused(points: MapPoints) -> None:
             module.files(bare)
 
 
-def test_measures_of_an_earlier_export_do_not_stay(points: MapPoints, tmp_path: Path) -> None:
+def test_measures_of_an_earlier_export_are_removed(points: MapPoints, tmp_path: Path) -> None:
     export(points, "mmvii", tmp_path)
     mine = tmp_path / "mmvii" / "notes.txt"
     mine.touch()
@@ -249,7 +249,7 @@ def test_colmap_reads_the_priors_from_its_database(
         )
 
 
-def test_colmap_says_that_priors_of_other_images_stay(
+def test_the_colmap_script_reports_priors_that_it_keeps_for_other_images(
     points: MapPoints,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -283,7 +283,7 @@ def _make_database(pycolmap: ModuleType, path: Path, names: list[str]) -> None:
     database.close()
 
 
-def test_colmap_list_for_the_aligner(points: MapPoints) -> None:
+def test_the_colmap_list_has_the_aligner_s_format(points: MapPoints) -> None:
     texts = colmap.files(points)
     reference = [line.split() for line in texts["colmap/reference.txt"].splitlines()]
     table = [*csv.DictReader(texts["colmap/pose_priors.csv"].splitlines())]

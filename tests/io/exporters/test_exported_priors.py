@@ -39,6 +39,6 @@ def test_camera_priors_have_position_angles_and_covariance(points: MapPoints) ->
         assert row["crs"] == "EPSG:25831"
 
 
-def test_camera_priors_need_priors(make_points: Factory) -> None:
+def test_exporting_camera_priors_without_any_is_an_error(make_points: Factory) -> None:
     with pytest.raises(KgcpError, match="no camera can be oriented"):
         camera_priors.files(make_points())

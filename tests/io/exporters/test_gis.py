@@ -46,7 +46,7 @@ def test_gdal_reads_the_geopackage(points: MapPoints, tmp_path: Path) -> None:
         "+proj=tmerc +lat_0=0 +lon_0=12 +x_0=4500000 +ellps=bessel +type=crs",
     ],
 )
-def test_the_geopackage_has_any_crs(in_degrees: MapPoints, tmp_path: Path, crs: str) -> None:
+def test_the_geopackage_can_hold_any_crs(in_degrees: MapPoints, tmp_path: Path, crs: str) -> None:
     pyogrio = pytest.importorskip("pyogrio")
     export(replace(in_degrees, crs=crs), "geopackage", tmp_path)
     information = pyogrio.read_info(tmp_path / "geopackage" / "kgcps.gpkg")
@@ -69,7 +69,9 @@ def test_the_geopackage_keeps_the_datum_of_a_proj_string(
     assert "TOWGS84[598.1,73.7,418.2,0.202,0.045,-2.455,6.7]" in row[1]
 
 
-def test_a_crs_without_well_known_text_1_is_one_line(points: MapPoints, tmp_path: Path) -> None:
+def test_a_crs_without_well_known_text_1_is_a_one_line_error(
+    points: MapPoints, tmp_path: Path
+) -> None:
     bogota = replace(points, crs="EPSG:6247", priors=())
     with pytest.raises(KgcpError, match=r"^geopackage: crs 'EPSG:6247' has no form"):
         export(bogota, "geopackage", tmp_path)

@@ -98,7 +98,7 @@ def read_control(
     )
 
 
-def test_a_reader_gets_points_marks_and_accuracies(points: MapPoints, tmp_path: Path) -> None:
+def test_the_xml_has_points_marks_and_accuracies(points: MapPoints, tmp_path: Path) -> None:
     export(points, "itwin", tmp_path)
     controls = read_block(tmp_path / "itwin/block.xml")
     assert [*controls] == ["K0001", "K0002", "K0003", "K0004", "K0005", "north_gate"]
@@ -134,7 +134,9 @@ def test_unknown_accuracies_are_left_out(points: MapPoints, tmp_path: Path) -> N
     ("crs", "definition"),
     [("EPSG:25831+5773", "EPSG:25831+5773"), ("+proj=tmerc +lat_0=41 +ellps=GRS80", "PROJCS[")],
 )
-def test_other_systems(points: MapPoints, tmp_path: Path, crs: str, definition: str) -> None:
+def test_other_coordinate_systems_are_written(
+    points: MapPoints, tmp_path: Path, crs: str, definition: str
+) -> None:
     export(replace(points, crs=crs, priors=()), "itwin", tmp_path)
     control = read_block(tmp_path / "itwin/block.xml")["K0001"]
     assert control.definition.startswith(definition)
@@ -223,7 +225,7 @@ def test_moving_points_of_an_earlier_export_are_removed(
     assert "moving points of an earlier export removed: 1" in capsys.readouterr().out
 
 
-def test_names_that_repeat_are_told_apart_by_their_folders(
+def test_equal_image_names_are_distinguished_by_their_folders(
     points: MapPoints, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first, second, third = points.gcps[:3]

@@ -33,7 +33,7 @@ def test_separators_in_file_names_are_refused(points: MapPoints) -> None:
 # --- Pix4D -------------------------------------------------------------------------------------
 
 
-def test_pix4d_points_and_marks(points: MapPoints) -> None:
+def test_pix4d_gets_points_and_marks(points: MapPoints) -> None:
     texts = pix4d.files(points)
     rows = [line.split(",") for line in texts["pix4d/gcps.csv"].splitlines()]
     assert [row[0] for row in rows] == ["K0001", "K0002", "K0003", "K0004", "north_gate"]
@@ -179,7 +179,7 @@ def test_points_in_degrees_have_no_scene_frame(
     assert "scene_reference_frame" not in (tmp_path / "opf/project.opf").read_text("utf-8")
 
 
-def test_opf_escapes_paths_and_says_what_feet_are(make_points: Factory) -> None:
+def test_opf_escapes_paths_and_states_the_length_of_feet(make_points: Factory) -> None:
     point = make_points().gcps[0]
     spaced = replace(point, frame="a/IMG 1.JPG", position_map=np.array([987000.0, 2e5, 100.0]))
     texts = opf.files(make_points("EPSG:2263", (spaced,)))
@@ -218,7 +218,7 @@ def test_opensfm_reads_the_same_points_and_pixels(points: MapPoints) -> None:
     assert edge["projection"] == pytest.approx([-0.5, 600.5 / 1600.0], abs=1e-9)
 
 
-def test_opensfm_camera_positions(points: MapPoints) -> None:
+def test_opensfm_gets_camera_positions(points: MapPoints) -> None:
     shots = json.loads(opensfm.files(points)["opensfm/exif_overrides.json"])
     to_grid = Transformer.from_crs("EPSG:4326", "EPSG:25831", always_xy=True)
     for prior in points.priors:
@@ -228,7 +228,7 @@ def test_opensfm_camera_positions(points: MapPoints) -> None:
         assert gps["dop"] == pytest.approx(0.4, rel=1e-3)
 
 
-def test_opensfm_shifts_datums(make_points: Factory) -> None:
+def test_opensfm_gets_points_converted_to_wgs84(make_points: Factory) -> None:
     """The old observatory of Bern, origin of CH1903+, by swisstopo's formulae for WGS 84.
 
     Their constant terms, in 10 000″; the formulae hold to 0.12″ and 0.08″. On CH1903+ itself the
@@ -242,7 +242,7 @@ def test_opensfm_shifts_datums(make_points: Factory) -> None:
     assert entry["position"]["latitude"] == pytest.approx(16.9023892 * 1e4 / 3600, abs=3e-5)
 
 
-def test_an_unknown_datum_is_an_error_and_no_guess(make_points: Factory) -> None:
+def test_an_unknown_datum_is_an_error(make_points: Factory) -> None:
     points = make_points("+proj=tmerc +lat_0=41 +lon_0=2 +ellps=GRS80")
     with pytest.raises(KgcpError, match=r"opensfm: .*WGS 84"):
         opensfm.files(points)

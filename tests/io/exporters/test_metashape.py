@@ -187,7 +187,7 @@ def test_positions_and_markers_of_others_stay_as_they_are(
 
 
 @pytest.mark.parametrize("extensions", [True, False])
-def test_photos_of_one_name_are_told_apart_by_their_folders(
+def test_photos_with_the_same_name_are_distinguished_by_their_folders(
     points: MapPoints, tmp_path: Path, capsys: pytest.CaptureFixture[str], *, extensions: bool
 ) -> None:
     """As of two flights whose cameras count from 1: labels repeat, folders do not."""
@@ -208,7 +208,7 @@ def test_photos_of_one_name_are_told_apart_by_their_folders(
     assert not (tmp_path / "metashape/markers.xml").exists(), "labels cannot tell them apart"
 
 
-def test_photos_that_are_missing_or_double_are_named(
+def test_missing_and_duplicate_photos_are_named(
     points: MapPoints, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     chunk = chunk_of("IMG_1.JPG", "IMG_3.JPG", "IMG_3.JPG")
@@ -264,7 +264,7 @@ def test_the_script_knows_the_crs(points: MapPoints, crs: str, definition: str) 
     assert "@" not in text
 
 
-def test_what_is_unknown_is_left_to_metashape(points: MapPoints, tmp_path: Path) -> None:
+def test_unknown_values_keep_metashape_s_defaults(points: MapPoints, tmp_path: Path) -> None:
     unknown = (
         replace(point, cov_m2=None, centre_cov_px2=None, sd_distance_m=None)
         for point in points.gcps

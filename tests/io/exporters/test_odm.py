@@ -39,7 +39,7 @@ def test_odm_reads_the_same_points_and_pixels(points: MapPoints) -> None:
         np.testing.assert_allclose([*map(float, row[3:5])], point.centre_px, atol=1e-6, rtol=0)
 
 
-def test_the_list_says_in_which_order_its_columns_are(points: MapPoints) -> None:
+def test_the_list_states_the_order_of_its_columns(points: MapPoints) -> None:
     _, order, note = _lines(points)[:3]
     assert order == "# x (easting or longitude), y, height [m], pixel x, y, image, point"
     assert note.startswith("#")
@@ -82,7 +82,7 @@ def test_odm_gets_longitude_first_with_millimetre_digits(in_degrees: MapPoints) 
         ("EPSG:32661", None),
     ],
 )
-def test_odm_headers(points: MapPoints, crs: str, header: str | None) -> None:
+def test_the_odm_header_names_the_crs(points: MapPoints, crs: str, header: str | None) -> None:
     assert _lines(replace(points, crs=crs, priors=()))[0] == (header or crs)
 
 
@@ -97,7 +97,7 @@ def test_odm_needs_a_code_or_a_proj_string(points: MapPoints) -> None:
         odm.files(replace(points, crs=local, priors=()))
 
 
-def test_odm_refuses_what_would_break_its_columns(points: MapPoints) -> None:
+def test_odm_refuses_names_that_would_break_its_columns(points: MapPoints) -> None:
     spaced = replace(points.gcps[0], frame="a/IMG 1.JPG")
     with pytest.raises(KgcpError, match="white space"):
         odm.files(replace(points, gcps=(spaced,)))
@@ -151,7 +151,7 @@ def test_yaw_pitch_and_roll_turn_a_camera_as_odm_does(points: MapPoints) -> None
     np.testing.assert_allclose(angles, [-123.0, 11.0, -7.0], rtol=0, atol=1e-6)
 
 
-def test_no_accuracies_are_made_up(points: MapPoints) -> None:
+def test_unknown_accuracies_are_not_invented(points: MapPoints) -> None:
     prior = replace(points.priors[0], cov=None)
     lines = str(odm.files(replace(points, priors=(prior,)))["odm/geo.txt"]).splitlines()
     assert len(lines[1].split()) == 7

@@ -40,7 +40,7 @@ def test_longitude_comes_first(in_degrees: MapPoints) -> None:
 
 
 @pytest.mark.parametrize(("extensions", "name"), [(True, "IMG_1.JPG"), (False, "IMG_1")])
-def test_measurements_begin_at_the_corner(
+def test_image_coordinates_count_from_the_corner_of_the_frame(
     points: MapPoints, name: str, *, extensions: bool
 ) -> None:
     texts = realityscan.files(replace(points, image_extensions=extensions))
@@ -52,14 +52,14 @@ def test_measurements_begin_at_the_corner(
     assert {row[1] for row in marks} >= {"K0005", "north_gate"}
 
 
-def test_what_would_be_read_as_a_comment_is_refused(points: MapPoints) -> None:
+def test_names_that_would_be_read_as_comments_are_refused(points: MapPoints) -> None:
     for bad in ("IMG#1.JPG", "IMG;1.JPG"):
         frame = replace(points.gcps[0], frame=bad)
         with pytest.raises(KgcpError, match="in its name"):
             realityscan.files(replace(points, gcps=(frame,)))
 
 
-def test_accuracies_are_needed(points: MapPoints) -> None:
+def test_points_without_accuracies_are_refused(points: MapPoints) -> None:
     unknown = replace(points.gcps[0], cov_m2=None)
     with pytest.raises(KgcpError, match="no standard deviations"):
         realityscan.files(replace(points, gcps=(unknown,)))

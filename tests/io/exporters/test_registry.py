@@ -71,7 +71,7 @@ def test_the_page_has_every_format_and_default() -> None:
     assert set(DEFAULT_FORMATS) <= set(FORMATS)
 
 
-def test_a_thousand_points_take_no_time(make_points: Factory, tmp_path: Path) -> None:
+def test_a_thousand_points_are_exported_quickly(make_points: Factory, tmp_path: Path) -> None:
     """A coarse guard: CPU time, ten times what it should be."""
     one = make_points().gcps[0]
     gcps = tuple(
@@ -85,7 +85,7 @@ def test_a_thousand_points_take_no_time(make_points: Factory, tmp_path: Path) ->
     assert time.process_time() - begin_s < 15.0
 
 
-def test_points_images_and_cameras_fit_together_again(make_points: Factory) -> None:
+def test_exported_points_images_and_cameras_agree(make_points: Factory) -> None:
     """Project by OpenCV what a reader of OPF and of camera_priors.csv gets: the same pixels."""
     template = make_points()
     local_frame = LocalFrame.at(template.crs, template.gcps[0].position_map)
@@ -132,7 +132,7 @@ def test_points_images_and_cameras_fit_together_again(make_points: Factory) -> N
 
 
 @pytest.mark.parametrize("name", ["metashape", "mmvii"])
-def test_packages_that_take_distances_are_told_what_these_hang_on(
+def test_how_tos_of_packages_with_distances_explain_their_common_error(
     points: MapPoints, tmp_path: Path, name: str
 ) -> None:
     """1.23 cm of 79 m are 0.016 % of the distance; assumed, where flight.toml says nothing."""

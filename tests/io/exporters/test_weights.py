@@ -126,9 +126,7 @@ def test_marks_of_packages_have_the_floor(sharp: MapPoints, name: str, tmp_path:
     assert max(exact) < 0.0025
 
 
-def test_metashape_is_told_the_accuracy_and_gets_distances(
-    sharp: MapPoints, tmp_path: Path
-) -> None:
+def test_metashape_gets_distances_and_their_accuracy(sharp: MapPoints, tmp_path: Path) -> None:
     export(sharp, "metashape", tmp_path)
     howto = (tmp_path / "metashape/HOWTO.txt").read_text(encoding="utf-8")
     assert "has one for all: 0.100 px" in howto
@@ -149,7 +147,7 @@ def test_mmvii_gets_the_same_distances(sharp: MapPoints, tmp_path: Path) -> None
     assert "share of 0.03 % is assumed" in (tmp_path / "mmvii/HOWTO.txt").read_text()
 
 
-def test_csv_and_maps_keep_what_was_measured(sharp: MapPoints, tmp_path: Path) -> None:
+def test_csv_and_gis_files_keep_the_measured_accuracies(sharp: MapPoints, tmp_path: Path) -> None:
     export(sharp, "csv", tmp_path)
     with (tmp_path / "kgcps.csv").open(encoding="utf-8") as stream:
         for row in csv.DictReader(stream):

@@ -90,13 +90,13 @@ def test_a_field_toml_is_read_back_as_it_was_written(tmp_path: Path) -> None:
     assert read_field(write(tmp_path, "field.toml", field_toml(field))) == field
 
 
-def test_marks_take_the_diameter_of_all(tmp_path: Path) -> None:
+def test_marks_have_the_common_diameter_by_default(tmp_path: Path) -> None:
     field = read_grid(write(tmp_path, "field.toml", TOML))
     assert field.marks == (Mark(2, 2, 0.015, 0.006),)
     assert field.flat_sd_m == (0.00005, 0.00005, 0.0003)
 
 
-def test_shorthands() -> None:
+def test_shorthands_describe_a_grid() -> None:
     grid = read_grid("grid:10x8:25mm:15mm")
     assert (grid.kind, grid.columns, grid.rows) == (GridKind.SQUARE, 10, 8)
     assert [grid.pitch_m, grid.diameter_m] == pytest.approx([0.025, 0.015])
@@ -106,7 +106,7 @@ def test_shorthands() -> None:
     assert not bright.is_diameter_stated
 
 
-def test_boofcv_does_not_say_its_unit(tmp_path: Path) -> None:
+def test_a_boofcv_file_needs_a_stated_unit(tmp_path: Path) -> None:
     path = write(tmp_path, "calibration_target.yaml", BOOFCV)
     with pytest.raises(KgcpError, match="does not state its unit") as caught:
         read_field(path)
@@ -204,7 +204,7 @@ def test_plain_rings_on_a_square_lattice(tmp_path: Path) -> None:
         ({"marker_outer_radius_mm": 9.0}, "overlap at 13.8"),
     ],
 )
-def test_wrong_rings_end_in_one_line(
+def test_wrong_rings_are_a_one_line_error(
     tmp_path: Path, changes: dict[str, object], message: str
 ) -> None:
     with pytest.raises(KgcpError, match=message):
@@ -220,7 +220,7 @@ def test_wrong_rings_end_in_one_line(
         ("nothing.toml", "is neither a field's file nor a shorthand"),
     ],
 )
-def test_wrong_shorthands(text: str, message: str) -> None:
+def test_wrong_shorthands_are_refused(text: str, message: str) -> None:
     with pytest.raises(KgcpError, match=message):
         read_field(text)
 
@@ -237,7 +237,7 @@ def test_wrong_shorthands(text: str, message: str) -> None:
         ("[grid]", "[code]\nbits = 14\n[grid]", "code: is given beside a grid"),
     ],
 )
-def test_wrong_field_toml(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_a_wrong_field_toml_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
     path = write(tmp_path, "field.toml", TOML.replace(old, new, 1))
     with pytest.raises(KgcpError, match=message) as caught:
         read_field(path)
@@ -266,7 +266,9 @@ def test_wrong_field_toml(tmp_path: Path, old: str, new: str, message: str) -> N
         (ROS, "rows: 10", "rows: -3"),
     ],
 )
-def test_damaged_boards_are_one_line(tmp_path: Path, text: str, old: str, new: str) -> None:
+def test_damaged_board_files_are_a_one_line_error(
+    tmp_path: Path, text: str, old: str, new: str
+) -> None:
     unit = "mm" if text == BOOFCV else None
     with pytest.raises(KgcpError, match="board"):
         read_field(write(tmp_path, "board", text.replace(old, new, 1)), unit)
@@ -310,7 +312,7 @@ G,0.3,0.1,0,1e-5,1e-5,2e-5,0,0,1,13
 """
 
 
-def test_points_with_coordinates_of_their_own(tmp_path: Path) -> None:
+def test_points_may_have_individual_coordinates(tmp_path: Path) -> None:
     write(tmp_path, "field.csv", POINTS_CSV)
     field = read_field(write(tmp_path, "field.toml", POINTS_TOML))
     assert isinstance(field, PointField)
@@ -347,7 +349,7 @@ def test_points_with_coordinates_of_their_own(tmp_path: Path) -> None:
         (("", ""), ("0,1,5\n", "0,1,3\n"), "code: 3 stands 2 times"),
     ],
 )
-def test_wrong_points_end_in_one_line(
+def test_wrong_points_are_a_one_line_error(
     tmp_path: Path, toml: tuple[str, str], rows: tuple[str, str], message: str
 ) -> None:
     write(tmp_path, "field.csv", POINTS_CSV.replace(*rows, 1))
@@ -382,7 +384,7 @@ NXYZ = """\
 
 
 @pytest.mark.parametrize("head", ["", "Name X Y Z\n"])
-def test_lists_of_points_do_not_say_their_unit(tmp_path: Path, head: str) -> None:
+def test_lists_of_points_need_a_stated_unit(tmp_path: Path, head: str) -> None:
     path = write(tmp_path, "points.txt", head + NXYZ)
     with pytest.raises(KgcpError, match="does not state its unit") as caught:
         read_field(path)
@@ -413,6 +415,6 @@ def test_points_of_a_list_may_lie_close_together(tmp_path: Path) -> None:
         ("100 0 0 0.01 0.01", "100 0 0 -0.01 0.01", "sd of 2: -1e-05 m is out of range"),
     ],
 )
-def test_wrong_lists_end_in_one_line(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_wrong_lists_are_a_one_line_error(tmp_path: Path, old: str, new: str, message: str) -> None:
     with pytest.raises(KgcpError, match=message):
         read_field(write(tmp_path, "points.txt", NXYZ.replace(old, new)), "mm")

@@ -93,7 +93,7 @@ def changed(old: str, new: str) -> str:
     return FLIGHT.replace(old, new)
 
 
-def test_every_value_arrives_in_its_record(write: Write) -> None:
+def test_every_value_is_read_into_its_record(write: Write) -> None:
     folder = write(FLIGHT)
     flight = read_flight(folder)
     assert (flight.name, flight.crs, flight.toml_text) == ("odd angles", "EPSG:25831", FLIGHT)
@@ -141,7 +141,7 @@ def test_replicas_belong_to_their_plate(write: Write) -> None:
     assert (plate.position_m, post.position_m) == (None, (346937.1, 4582508.6, 122.0))
 
 
-def test_what_may_be_left_out_has_the_folder_s_defaults(tmp_path: Path, write: Write) -> None:
+def test_optional_keys_have_the_defaults_of_the_folder(tmp_path: Path, write: Write) -> None:
     camera_and_target = FLIGHT[FLIGHT.index("[camera]") : FLIGHT.index('[[target]]\nname = "post')]
     folder = write(camera_and_target.replace("plumb_sd_deg = 8\n", ""))
     (tmp_path / "frames").mkdir()
@@ -229,7 +229,7 @@ def test_what_may_be_left_out_has_the_folder_s_defaults(tmp_path: Path, write: W
         ('"car.csv"', r'"data\car.csv"', "is not TOML: .*; write / instead of"),
     ],
 )  # fmt: skip
-def test_a_bad_value_is_one_line_with_file_key_and_remedy(
+def test_a_bad_value_is_a_one_line_error_with_file_key_and_remedy(
     write: Write, old: str, new: str, message: str
 ) -> None:
     folder = write(changed(old, new))
@@ -241,7 +241,7 @@ def test_a_bad_value_is_one_line_with_file_key_and_remedy(
     assert ";" in text, "the remedy follows a semicolon"
 
 
-def test_a_calibration_file_is_a_file(write: Write) -> None:
+def test_a_folder_is_no_calibration_file(write: Write) -> None:
     inline = FLIGHT[FLIGHT.index("[camera]") : FLIGHT.index("[[target]]")]
     folder = write(FLIGHT.replace(inline, '[camera]\nfile = "pictures"\n\n', 1))
     with pytest.raises(KgcpError, match=r"\[camera\] file: 'pictures' is not a regular file; name"):
@@ -256,12 +256,12 @@ def test_a_flight_needs_a_target(write: Write) -> None:
         read_flight(write(without + "[target]\nname = 'A'\n"))
 
 
-def test_a_folder_without_flight_toml_says_what_it_lacks(tmp_path: Path) -> None:
+def test_a_folder_without_flight_toml_is_refused_with_what_it_lacks(tmp_path: Path) -> None:
     with pytest.raises(KgcpError, match=r"flight.toml: does not exist; name a flight folder"):
         read_flight(tmp_path)
 
 
-def test_an_ending_that_notepad_has_added_is_told(tmp_path: Path) -> None:
+def test_an_extension_that_notepad_added_is_named(tmp_path: Path) -> None:
     (tmp_path / "flight.toml.txt").touch()
     with pytest.raises(KgcpError, match=r"flight\.toml: does not exist; rename flight\.toml\.txt,"):
         read_flight(tmp_path)
@@ -294,7 +294,7 @@ def test_other_encodings_are_refused_and_a_byte_order_mark_is_not(write: Write) 
     start_deg=st.floats(0.0, 100.0),
     gaps_deg=st.lists(st.floats(24.0, 60.0), min_size=1, max_size=3),
 )
-def test_numbers_survive_the_file(
+def test_numbers_are_read_back_as_they_were_written(
     write: Write,
     fx: float,
     k1: float,

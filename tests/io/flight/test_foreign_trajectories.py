@@ -62,7 +62,9 @@ def places(folder: Path, keys: str) -> tuple[FloatArray, FloatArray]:
     )
 
 
-def test_sbet_with_its_accuracies(tmp_path: Path, vehicle: dict[str, FloatArray]) -> None:
+def test_an_sbet_is_read_with_its_accuracies(
+    tmp_path: Path, vehicle: dict[str, FloatArray]
+) -> None:
     gps = vehicle["time"] + GPS_AHEAD_S - datetime(1980, 1, 6, tzinfo=UTC).timestamp()
     zeros = np.zeros_like(gps)
     angles = [np.radians(vehicle[name]) for name in ("lat", "lon")]
@@ -85,7 +87,7 @@ def test_sbet_with_its_accuracies(tmp_path: Path, vehicle: dict[str, FloatArray]
 
 
 @pytest.mark.parametrize(("clock", "ahead_s"), [("GPST", 18.0), ("UTC", 0.0), ("JST", 32400.0)])
-def test_rtklib_with_the_course(
+def test_rtklib_positions_are_read_with_the_course_as_heading(
     tmp_path: Path, vehicle: dict[str, FloatArray], clock: str, ahead_s: float
 ) -> None:
     lines = [

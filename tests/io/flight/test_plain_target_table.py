@@ -37,20 +37,20 @@ def read(folder: Path, *tables: str) -> tuple[PlainTarget, ...]:
     return read_flight(folder).plain_targets
 
 
-def test_disc_with_defaults(tmp_path: Path) -> None:
+def test_a_disc_has_defaults(tmp_path: Path) -> None:
     assert read(tmp_path, _HEAD, _DISC) == (
         PlainTarget("W", (0.3,), PlainPolarity.BRIGHT, (1.0, 2.0, 3.0)),
     )
     assert [each.name for each in read_flight(tmp_path).all_targets] == ["A", "W"]
 
 
-def test_flight_of_plain_targets_alone(tmp_path: Path) -> None:
+def test_a_flight_may_have_plain_targets_only(tmp_path: Path) -> None:
     (target,) = read(tmp_path, _HEAD.partition("[[target]]")[0], _DISC)
     assert target.name == "W"
     assert read_flight(tmp_path).targets == ()
 
 
-def test_ring_with_every_key(tmp_path: Path) -> None:
+def test_a_ring_is_read_with_every_key(tmp_path: Path) -> None:
     ring = """
 [[target]]
 name = "R"
@@ -83,7 +83,7 @@ thickness_m = 0.03
 
 
 @pytest.mark.parametrize(("written", "normal"), [("level", (0.0, 0.0, 1.0)), ("free", None)])
-def test_a_normal_in_words(
+def test_a_normal_may_be_given_in_words(
     tmp_path: Path, written: str, normal: tuple[float, float, float] | None
 ) -> None:
     (target,) = read(tmp_path, _HEAD, f'{_DISC}normal = "{written}"\n')
@@ -112,7 +112,9 @@ def test_a_normal_in_words(
         ),
     ],
 )
-def test_one_line_for_what_is_wrong(tmp_path: Path, change: tuple[str, str], message: str) -> None:
+def test_wrong_values_are_a_one_line_error(
+    tmp_path: Path, change: tuple[str, str], message: str
+) -> None:
     with pytest.raises(KgcpError) as caught:
         read(tmp_path, _HEAD, _DISC.replace(*change))
     line = str(caught.value)

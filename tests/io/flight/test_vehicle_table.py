@@ -20,7 +20,7 @@ def read(folder: Path, lines: str) -> VehicleTable | None:
     return read_vehicle(TomlTable("flight.toml:", values, ("vehicle",)), folder)
 
 
-def test_without_keys_the_file_speaks_for_itself(tmp_path: Path) -> None:
+def test_without_keys_all_options_of_the_trajectory_have_defaults(tmp_path: Path) -> None:
     vehicle = read(tmp_path, "")
     assert vehicle is not None
     assert vehicle.trajectory_file == tmp_path / "v.out"
@@ -29,7 +29,7 @@ def test_without_keys_the_file_speaks_for_itself(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("day", ['"2026-05-04"', "2026-05-04"])
-def test_every_key_arrives_in_its_record(tmp_path: Path, day: str) -> None:
+def test_every_key_is_read_into_its_record(tmp_path: Path, day: str) -> None:
     vehicle = read(
         tmp_path,
         'format = "sbet"\ncrs = "EPSG:7912"\ntime_system = "gps"\naccuracies = "smrmsg.out"\n'
@@ -62,7 +62,7 @@ def test_every_key_arrives_in_its_record(tmp_path: Path, day: str) -> None:
         ('trajectorie = "x"', "nearest known key is 'trajectory'"),
     ],
 )
-def test_what_is_wrong_is_named_by_its_key(tmp_path: Path, lines: str, words: str) -> None:
+def test_a_wrong_value_is_named_by_its_key(tmp_path: Path, lines: str, words: str) -> None:
     with pytest.raises(KgcpError) as caught:
         read(tmp_path, lines)
     message = str(caught.value)
@@ -72,7 +72,7 @@ def test_what_is_wrong_is_named_by_its_key(tmp_path: Path, lines: str, words: st
 
 
 @pytest.mark.parametrize("line", ["", "lever_arm_m = 3", "lever_arm_m = [1, 2]"])
-def test_a_lever_arm_is_asked_for_by_its_axes(line: str) -> None:
+def test_the_error_of_a_wrong_lever_arm_names_its_axes(line: str) -> None:
     values = tomllib.loads(f'[vehicle]\ntrajectory = "v.out"\n{line}')
     with pytest.raises(KgcpError, match=r"lever_arm_m: .*; give .*\[forward, right, down\]"):
         read_vehicle(TomlTable("flight.toml:", values, ("vehicle",)), Path())

@@ -64,19 +64,19 @@ def test_kgcp_reads_back_what_it_writes(tmp_path: Path, form: str) -> None:
 
 
 @pytest.mark.parametrize("form", ["opencv", "ros", "colmap"])
-def test_the_rational_model_is_kept_where_it_can_be(tmp_path: Path, form: str) -> None:
+def test_formats_that_can_hold_the_rational_model_keep_it(tmp_path: Path, form: str) -> None:
     read = read_calibration(write(tmp_path, RATIONAL, form), (1600, 1100))
     assert np.abs(read.distort(GRID) - RATIONAL.distort(GRID)).max() < 1e-9
 
 
 @pytest.mark.parametrize("form", ["metashape", "opensfm", "pix4d", "opf", "mmvii"])
-def test_what_a_format_cannot_hold_is_refused_by_name(form: str) -> None:
+def test_terms_that_a_format_cannot_hold_are_refused_by_name(form: str) -> None:
     with pytest.raises(KgcpError, match="k4, k5, k6"):
         camera_file(made(RATIONAL), form)
 
 
 @pytest.mark.parametrize("form", ["pix4d", "opf", "mmvii"])
-def test_one_focal_length_is_not_two(form: str) -> None:
+def test_formats_with_one_focal_length_refuse_two(form: str) -> None:
     with pytest.raises(KgcpError, match="fx and fy differ"):
         camera_file(made(replace(CAMERA, fx=1706.0)), form)
 
@@ -157,7 +157,7 @@ def test_opensfm_overrides_all_cameras() -> None:
     assert list(document) == ["all"]
 
 
-def test_a_camera_toml_brings_its_covariance(tmp_path: Path) -> None:
+def test_camera_toml_contains_the_covariance(tmp_path: Path) -> None:
     camera = replace(CAMERA, response=Response.SRGB)
     known = CalibrationCovariance(covariance(("fx", "cx", "cy", "k1", "k3")))
     path = tmp_path / "camera.toml"

@@ -54,7 +54,9 @@ def test_marks_are_gps_times_joined_by_number(tmp_path: Path) -> None:
         ("survey_3_00001.png", "survey_3_00003.png"),
     ],
 )
-def test_the_last_number_of_a_name_is_the_mark_s(tmp_path: Path, names: tuple[str, str]) -> None:
+def test_the_last_number_in_a_file_name_is_that_of_the_mark(
+    tmp_path: Path, names: tuple[str, str]
+) -> None:
     times = read_times(write(tmp_path, *MARKS), names).time_s
     assert times[names[1]] == pytest.approx(THIRD_S, abs=1e-6)
     assert times.keys() == {*names, "2"}  # a mark of no frame is called by its number
@@ -76,7 +78,7 @@ def test_frames_of_two_flights_cannot_share_marks(tmp_path: Path, names: tuple[s
 
 
 @pytest.mark.parametrize("week", ["2265", "2264"])  # counted on, or not
-def test_marks_go_over_saturday_midnight(tmp_path: Path, week: str) -> None:
+def test_marks_continue_over_saturday_midnight(tmp_path: Path, week: str) -> None:
     path = write(tmp_path, f"1\t604799.5\t[2264]{TAIL}", f"2\t0.5\t[{week}]{TAIL}")
     times = read_times(path, FRAMES[:2]).time_s
     assert times[FRAMES[1]] - times[FRAMES[0]] == pytest.approx(1.0, abs=1e-6)
@@ -117,7 +119,7 @@ def test_events_belong_to_the_frames_in_their_order(tmp_path: Path) -> None:
     }
 
 
-def test_a_lost_event_leaves_no_guess(tmp_path: Path) -> None:
+def test_a_missing_event_is_an_error(tmp_path: Path) -> None:
     path = write(tmp_path, *HEADER, *EVENTS[:2], name="rover_events.pos")
     words = "has 2 events for 3 frames, .*one event per epoch .* frames.csv"
     with pytest.raises(KgcpError, match=words):
@@ -220,7 +222,7 @@ def test_a_table_may_have_the_camera_s_rates(tmp_path: Path) -> None:
     assert np.degrees(rotation.sd_rad_s) == pytest.approx(1.0)
 
 
-def test_rates_are_those_about_three_axes(tmp_path: Path) -> None:
+def test_rotation_rates_need_all_three_axes(tmp_path: Path) -> None:
     path = tmp_path / "frames.csv"
     header = RATES.removesuffix(",rate_z_deg_s")
     path.write_text(f"{header}\na.jpg,2026-06-16T08:15:05Z,10,-4\n", encoding="utf-8")

@@ -41,7 +41,7 @@ def test_frames_may_be_named_with_backslashes(tmp_path: Path) -> None:
         (SOUND + "b/f.png,A,1,1,1e-300\n", "line 4: sd_px is 1e-300; give .* of 0.001 or more"),
     ],
 )
-def test_faults_are_told(tmp_path: Path, rows: str, problem: str) -> None:
+def test_wrong_marks_are_a_one_line_error(tmp_path: Path, rows: str, problem: str) -> None:
     with pytest.raises(KgcpError, match=problem) as caught:
         read(tmp_path / "m.csv", HEADER + rows)
     assert "\n" not in str(caught.value)

@@ -17,7 +17,7 @@ from kgcp.io.formats.name_times import times_of_names
         ("img_2026-06-16_08-15-05-250000Z", 1781597705.25),
     ],
 )
-def test_times_in_names(stem: str, time_s: float) -> None:
+def test_times_are_read_from_file_names(stem: str, time_s: float) -> None:
     times = times_of_names([f"cam/{stem}.png"])
     assert times is not None
     assert times[f"cam/{stem}.png"] == pytest.approx(time_s, abs=1e-6)
@@ -43,5 +43,5 @@ def test_microseconds_are_no_numbers_of_frames() -> None:
         ["a/1781597705.5.png", "b/1781597705.5.png"],  # two frames of one moment
     ],
 )
-def test_names_without_usable_times(names: list[str]) -> None:
+def test_names_without_usable_times_give_none(names: list[str]) -> None:
     assert times_of_names(names) is None

@@ -23,7 +23,7 @@ HEADER = "time,x,y,z,roll_deg,pitch_deg,heading_deg\n"
         (b"words\n", "of a known format \\([a-z0-9, ]+\\); "),
     ],
 )
-def test_what_a_file_of_another_format_is_instead(
+def test_a_file_of_another_kind_is_recognised_and_named(
     tmp_path: Path, content: bytes, words: str
 ) -> None:
     path = tmp_path / "file"

@@ -62,7 +62,7 @@ def read(tmp_path: Path) -> Read:
     return read_ring
 
 
-def test_the_flips_of_the_paper_are_the_target_of_the_paper(read: Read) -> None:
+def test_the_code_of_the_paper_gives_the_target_of_the_paper(read: Read) -> None:
     ring = read(PAPER, "sd_outer_diameter_m = 0.0005")
     assert ring.code_deg == pytest.approx(CONTRACT.code_deg, abs=0.001)
     assert (ring.outer_diameter_m, ring.inner_diameter_m) == (0.9, 0.45)
@@ -129,7 +129,7 @@ def test_files_may_have_several_targets(read: Read) -> None:
         (TWO.replace("d = 0.6;", ""), "id = 1", "targets: has no 'd'; correct the file"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(
+def test_wrong_files_are_a_one_line_error(
     read: Read, content: str, keys: str, problem: str
 ) -> None:
     with pytest.raises(KgcpError) as error:

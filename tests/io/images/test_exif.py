@@ -63,7 +63,7 @@ def test_local_time_of_an_unknown_zone_is_no_time(tmp_path: Path, offset: str | 
     ("changed", "expected"),
     [("2026:05:04 11:30:05", ON_2026_05_04_AT_9_30 + 5.05), ("2026:05:11 20:00:00", None)],
 )
-def test_the_zone_of_the_last_change_serves_if_nothing_was_changed(
+def test_the_offset_of_the_modification_time_is_used_if_both_times_agree(
     tmp_path: Path, changed: str, expected: float | None
 ) -> None:
     exif = Image.Exif()
@@ -76,7 +76,7 @@ def test_the_zone_of_the_last_change_serves_if_nothing_was_changed(
     assert time_s == (None if expected is None else pytest.approx(expected, abs=1e-6))
 
 
-def test_offsets_may_lie_before_utc_and_between_hours(tmp_path: Path) -> None:
+def test_utc_offsets_may_be_negative_and_fractional(tmp_path: Path) -> None:
     for offset, hours in (("-03:30", 3.5), ("+05:45", -5.75), ("Z", 0.0), ("+00:00", 0.0)):
         tags = {**WHOLE, DATE_TIME: "2026:05:04 09:30:05", OFFSET: offset}
         time_s = read_exif(tagged(tmp_path / "frame.jpg", tags)).time_s
@@ -84,7 +84,7 @@ def test_offsets_may_lie_before_utc_and_between_hours(tmp_path: Path) -> None:
         assert time_s == pytest.approx(expected, abs=1e-6)
 
 
-def test_stamps_of_gps_are_not_taken_for_the_exposure(tmp_path: Path) -> None:
+def test_gps_time_stamps_are_not_used_as_the_exposure_time(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif.get_ifd(EXIF_IFD)[DATE_TIME] = "2026:05:04 11:30:05"
     exif.get_ifd(GPS_IFD).update({0x001D: "2026:05:04", 0x0007: (9.0, 30.0, 4.0)})
@@ -102,21 +102,21 @@ def test_stamps_of_gps_are_not_taken_for_the_exposure(tmp_path: Path) -> None:
         {DATE_TIME: "yesterday", SUBSEC: "x", OFFSET: "Z"},
     ],
 )
-def test_tags_without_sense_are_none(tmp_path: Path, tags: Mapping[int, object]) -> None:
+def test_senseless_tags_are_ignored(tmp_path: Path, tags: Mapping[int, object]) -> None:
     assert read_exif(tagged(tmp_path / "frame.jpg", tags)) == Exif()
 
 
 @pytest.mark.parametrize(
     "content", [b"", b"text", b"\xff\xd8\xff\xe1\x00\x20Exif\0\0II*\0\xff\xff"]
 )
-def test_files_without_exif_give_nothing(tmp_path: Path, content: bytes) -> None:
+def test_files_without_exif_have_no_values(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "frame.jpg"
     path.write_bytes(content)
     assert read_exif(path) == Exif()
     assert read_exif(tmp_path / "missing.jpg") == Exif()
 
 
-def test_frames_of_large_cameras_are_not_taken_for_bombs(tmp_path: Path) -> None:
+def test_large_frames_are_not_refused_as_decompression_bombs(tmp_path: Path) -> None:
     path = tagged(tmp_path / "frame.png", WHOLE)
     data = bytearray(path.read_bytes())
     data[16:24] = (30_000).to_bytes(4, "big") * 2  # IHDR: 900 megapixels

@@ -40,7 +40,7 @@ def write(
     image.save(path, exif=exif, xmp=XMP % altitude)
 
 
-def test_a_drone_s_frame(tmp_path: Path) -> None:
+def test_position_and_camera_are_read_from_a_drone_s_frame(tmp_path: Path) -> None:
     write(tmp_path / "a.jpg")
     header = read_frame_header(tmp_path / "a.jpg", "day/a.jpg")
     assert (header.frame, header.size_px) == ("day/a.jpg", (64, 48))
@@ -52,7 +52,7 @@ def test_a_drone_s_frame(tmp_path: Path) -> None:
     assert header.altitude_m == pytest.approx(40.1)
 
 
-def test_the_south_and_altitudes_below_take_off(tmp_path: Path) -> None:
+def test_southern_latitudes_and_negative_altitudes_are_read(tmp_path: Path) -> None:
     write(tmp_path / "a.jpg", b"-3.5", "S")
     header = read_frame_header(tmp_path / "a.jpg", "a.jpg")
     assert header.latitude_deg == pytest.approx(-46.84292, abs=1e-5)
@@ -67,7 +67,7 @@ def test_the_south_and_altitudes_below_take_off(tmp_path: Path) -> None:
         ((ZERO, ZERO), (None, None)),  # no fix
     ],
 )
-def test_one_angle_of_zero_is_a_place(
+def test_a_position_with_one_angle_of_zero_is_valid(
     tmp_path: Path,
     place: tuple[tuple[float, ...], tuple[float, ...]],
     expected: tuple[object, object],
@@ -77,7 +77,7 @@ def test_one_angle_of_zero_is_a_place(
     assert (header.latitude_deg, header.longitude_deg) == expected
 
 
-def test_what_is_absent_or_damaged_is_none(tmp_path: Path) -> None:
+def test_missing_or_damaged_values_are_none(tmp_path: Path) -> None:
     assert read_frame_header(tmp_path / "gone.jpg", "gone.jpg") == FrameHeader("gone.jpg")
     (tmp_path / "noise.jpg").write_bytes(bytes(range(256)))
     assert read_frame_header(tmp_path / "noise.jpg", "n") == FrameHeader("n")

@@ -130,7 +130,9 @@ class TestReadGrey:
 
     @pytest.mark.parametrize("is_big", [False, True])
     @pytest.mark.parametrize("orientation", range(1, 9))
-    def test_nor_is_that_of_a_tiff(self, tmp_path: Path, orientation: int, *, is_big: bool) -> None:
+    def test_the_orientation_tag_of_a_tiff_is_not_applied(
+        self, tmp_path: Path, orientation: int, *, is_big: bool
+    ) -> None:
         image = textured()
         path = tmp_path / "frame.tif"
         Image.fromarray(image).save(path, tiffinfo={274: orientation}, big_tiff=is_big)
@@ -154,7 +156,7 @@ class TestReadGrey:
 
     @pytest.mark.parametrize("progressive", [0, 1])
     @pytest.mark.parametrize("damage", ["cut", "cut and ended", "short by 40", "zeroed"])
-    def test_a_damaged_jpeg_is_rejected_in_silence(
+    def test_a_damaged_jpeg_is_rejected_without_output_of_the_decoder(
         self, tmp_path: Path, capfd: pytest.CaptureFixture[str], damage: str, progressive: int
     ) -> None:
         data = encoded(textured(), ".jpg", cv2.IMWRITE_JPEG_PROGRESSIVE, progressive)
@@ -190,7 +192,7 @@ class TestReadGrey:
         path.write_bytes(data[:middle] + b"\xff\x02" + data[middle:])
         assert rejection(path).detail.startswith("Unsupported marker type")
 
-    def test_colours_for_printing_are_checked_for_damage_too(self, tmp_path: Path) -> None:
+    def test_cmyk_jpegs_are_checked_for_damage_too(self, tmp_path: Path) -> None:
         path = tmp_path / "frame.jpg"
         image = textured(channels=3)
         Image.fromarray(image).convert("CMYK").save(path, quality=95)
@@ -201,7 +203,7 @@ class TestReadGrey:
         assert rejection(path).detail.startswith("Corrupt JPEG data")
 
     @pytest.mark.parametrize("suffix", [".png", ".tif", ".bmp", ".webp", ".jp2"])
-    def test_other_damaged_images_are_rejected_in_silence(
+    def test_other_damaged_images_are_rejected_without_output_of_the_decoder(
         self, tmp_path: Path, capfd: pytest.CaptureFixture[str], suffix: str
     ) -> None:
         image = textured(channels=3)
@@ -234,7 +236,7 @@ except Rejection as rejection:
         assert int(kilobytes) < 100_000
 
     @pytest.mark.parametrize("content", [b"", b"\xff", b"no image at all\n" * 50])
-    def test_what_is_no_image_is_rejected(self, tmp_path: Path, content: bytes) -> None:
+    def test_a_file_that_is_no_image_is_rejected(self, tmp_path: Path, content: bytes) -> None:
         path = tmp_path / "text.jpg"
         path.write_bytes(content)
         caught = rejection(path)
@@ -278,7 +280,7 @@ except Rejection as rejection:
 
     @pytest.mark.parametrize("compression", ["tiff_lzw", "tiff_adobe_deflate", "jpeg"])
     @pytest.mark.parametrize("log_level", ["WARNING", "SILENT"])
-    def test_a_damaged_strip_is_rejected_in_silence(
+    def test_a_damaged_strip_is_rejected_without_output_of_the_decoder(
         self,
         tmp_path: Path,
         capfd: pytest.CaptureFixture[str],
@@ -299,7 +301,7 @@ except Rejection as rejection:
         assert capfd.readouterr() == ("", "")
 
     @pytest.mark.parametrize("shape", [(1, 1), (WIDTH, HEIGHT), (HEIGHT, WIDTH + 1)])
-    def test_another_size_is_rejected_with_both(
+    def test_a_frame_of_another_size_is_rejected_with_both_sizes(
         self, tmp_path: Path, shape: tuple[int, int]
     ) -> None:
         path = tmp_path / "frame.png"

@@ -121,7 +121,9 @@ def test_a_flight_in_googles_store_gives_the_bytes_of_a_local_one(
         ("-of-others", "gs://flights-of-others/flight.toml: does not exist; correct the"),
     ],
 )
-def test_what_googles_store_does_not_have_is_a_line(place: str, problem: str, query: str) -> None:
+def test_missing_objects_in_google_storage_are_a_one_line_error(
+    place: str, problem: str, query: str
+) -> None:
     done = CliRunner().invoke(main, ["detect", f"gs://anonymous@flights{place}{query}"])
     assert done.exit_code == 1
     assert done.output.startswith(f"kgcp: error: {problem}")

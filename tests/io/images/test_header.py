@@ -23,14 +23,14 @@ def saved(form: str, **options: object) -> bytes:
 
 
 @pytest.mark.parametrize("form", ["BMP", "JPEG", "PNG", "PPM", "TIFF", "WEBP"])
-def test_the_size_of_a_frame_stands_in_its_header(form: str) -> None:
+def test_the_size_of_a_frame_is_read_from_its_header(form: str) -> None:
     data = saved(form)
     assert image_size(BytesIO(data)) == SIZE
     assert with_stored_pixels(BytesIO(data)) == data
     assert image_size(BytesIO(data[:5])) is None
 
 
-def test_what_no_frame_may_be_has_no_size() -> None:
+def test_files_that_cannot_be_frames_have_no_size() -> None:
     assert image_size(BytesIO(saved("GIF"))) is None
     assert image_size(BytesIO(b"")) is None
 
@@ -51,7 +51,7 @@ def test_a_tiff_s_orientation_is_overwritten_and_nothing_else(*, is_big: bool) -
     place=st.integers(0, 300),
     noise=st.binary(max_size=60),
 )
-def test_no_header_is_trusted(head: bytes, place: int, noise: bytes) -> None:
+def test_damaged_headers_raise_no_exception(head: bytes, place: int, noise: bytes) -> None:
     data = head[:place] + noise + head[place + len(noise) :]
     size = image_size(BytesIO(data))
     assert size is None or len(size) == 2

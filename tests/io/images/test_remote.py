@@ -129,7 +129,7 @@ class Stop(NoProgress):
 
 
 @pytest.mark.usefixtures("bucket")
-def test_what_an_interrupted_run_has_done_is_kept_on_this_machine(
+def test_results_of_an_interrupted_run_are_kept_on_the_local_machine(
     bucket: FileSystem, endpoint: str, query: str, flight: Path, expected: bytes
 ) -> None:
     out = parsed_url(f"s3://flights/results/7{query}")
@@ -144,7 +144,9 @@ def test_what_an_interrupted_run_has_done_is_kept_on_this_machine(
     assert content(bucket, "flights/results/7/detections.parquet") == expected
 
 
-def test_a_frame_that_is_gone_is_no_row(bucket: FileSystem, query: str, flight: Path) -> None:
+def test_a_frame_missing_in_the_store_has_no_stamp_and_is_an_error_when_read(
+    bucket: FileSystem, query: str, flight: Path
+) -> None:
     folder = StoredFolder(f"s3://flights/one{query}", "frames")
     frames = frames_below(folder)
     assert frames == frames_below(flight / "frames")
@@ -161,7 +163,9 @@ def test_a_frame_that_is_gone_is_no_row(bucket: FileSystem, query: str, flight: 
         pass
 
 
-def test_no_name_leads_out_of_a_folder(bucket: FileSystem, endpoint: str, query: str) -> None:
+def test_no_object_name_leads_out_of_its_folder(
+    bucket: FileSystem, endpoint: str, query: str
+) -> None:
     assert bucket is not None
     client = boto3.client("s3", endpoint_url=f"http://{endpoint}", region_name="us-east-1")
     client.put_object(Bucket="flights", Key="bad/frames/..\\..\\out.png", Body=b"")
@@ -184,14 +188,16 @@ def test_no_name_leads_out_of_a_folder(bucket: FileSystem, endpoint: str, query:
     ],
 )
 @pytest.mark.usefixtures("bucket")
-def test_a_store_that_is_of_no_use_is_a_line(url: str, problem: str, query: str) -> None:
+def test_an_unusable_store_is_a_one_line_error(url: str, problem: str, query: str) -> None:
     done = detect(url.format(query=query))
     assert done.exit_code == 1
     assert done.output.startswith(f"kgcp: error: {problem}")
     assert done.output.count("\n") == 1
 
 
-def test_results_without_a_place_are_told_before_the_work(flight: Path, query: str) -> None:
+def test_a_missing_results_folder_is_reported_before_the_work_begins(
+    flight: Path, query: str
+) -> None:
     query = query.replace("allow_bucket_creation=true", "allow_bucket_creation=false")
     done = detect(str(flight), "--out", f"s3://nobody-has-it/results{query}")
     assert done.exit_code == 1

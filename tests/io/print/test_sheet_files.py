@@ -235,7 +235,7 @@ def photograph(print_grey: GreyArray, sheet: Sheet, pose: Pose, seed: int) -> Gr
 
 
 @pytest.mark.parametrize("number", range(len(TARGETS)))
-def test_what_was_printed_is_found_with_its_code(number: int) -> None:
+def test_printed_targets_are_found_with_their_code(number: int) -> None:
     """From the file to the measurement: right code, right heading, right scale."""
     rng = np.random.default_rng(100 + number)
     sheet = sheet_of(TARGETS[number])
@@ -371,7 +371,7 @@ def test_file_names_are_safe_and_differ() -> None:
         check_stems(["a b", "A_B"])
 
 
-def test_text_fits_into_its_room_and_knows_what_it_cannot_write() -> None:
+def test_text_fits_into_its_box_and_replaces_characters_it_cannot_write() -> None:
     words, size_mm = fit_text(Text("a very long name " * 9, (0.0, 0.0), 7.0, 50.0))
     outline = TextPath((0.0, 0.0), words, size=size_mm, prop=font(is_bold=False))
     assert outline.get_extents().x1 == pytest.approx(50.0, rel=0.01)

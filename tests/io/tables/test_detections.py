@@ -80,7 +80,7 @@ def test_rows_are_sorted_by_target_and_instance() -> None:
     }
 
 
-def test_a_whole_observation_leaves_nothing_empty() -> None:
+def test_a_complete_measurement_fills_every_column() -> None:
     row = detection_rows(FRAME, SHAPES)[1]
     assert [name for name in NAMES if row[name] is None] == []
     assert (row["status"], row["reason"], row["scale_used"]) == ("measured", "", "B-inner")
@@ -95,7 +95,7 @@ def test_a_whole_observation_leaves_nothing_empty() -> None:
     assert row["ambiguity"] == 17.5
 
 
-def test_what_a_method_does_not_give_is_null() -> None:
+def test_values_that_a_method_does_not_compute_are_null() -> None:
     row = detection_rows(FRAME, SHAPES)[2]
     empty = {name for name in NAMES if row[name] is None}
     deviations = {name for name in NAMES if name.startswith(("sd_", "alt_"))}
@@ -127,7 +127,7 @@ def test_every_reason_makes_a_row(reason: Reason) -> None:
     assert row["status"] != "measured"
 
 
-def test_rows_go_into_the_table_as_they_are(tmp_path: Path) -> None:
+def test_rows_are_read_back_from_the_table_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "detections.parquet"
     write_table(path, DETECTION_COLUMNS, detection_rows(FRAME, SHAPES), {})
     table = read_detections(path)

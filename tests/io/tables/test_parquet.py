@@ -36,7 +36,7 @@ def one_line(error: BaseException) -> str:
     return text
 
 
-def test_values_and_nulls_come_back(tmp_path: Path) -> None:
+def test_values_and_nulls_are_read_back_as_written(tmp_path: Path) -> None:
     path = tmp_path / "new" / "folder" / "t.parquet"
     write_table(path, COLUMNS, ROWS, {"version": "1.2", "toml": 'a = "ä"\n'})
     full, empty = read_table(path, COLUMNS).to_dict("records")
@@ -95,7 +95,7 @@ def test_rows_that_fail_half_way_leave_the_old_table(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_folder_that_cannot_be_is_a_known_error(tmp_path: Path) -> None:
+def test_an_impossible_folder_is_a_known_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way", encoding="utf-8")
     with pytest.raises(
         KgcpError, match=r"cannot be written .* choose another results folder"
@@ -112,7 +112,7 @@ def test_a_table_that_cannot_take_its_place_leaves_nothing(tmp_path: Path) -> No
     assert list(tmp_path.iterdir()) == [occupied]
 
 
-def test_missing_and_damaged_tables_say_so_in_one_line(tmp_path: Path) -> None:
+def test_missing_and_damaged_tables_are_a_one_line_error(tmp_path: Path) -> None:
     with pytest.raises(KgcpError, match="run 'kgcp detect' on this flight first") as caught:
         read_detections(tmp_path / "detections.parquet")
     one_line(caught.value)
@@ -146,6 +146,6 @@ def test_times_are_rounded_to_the_microsecond(time_s: float, microsecond: int) -
     assert time_cell(time_s) == expected
 
 
-def test_times_before_1970_and_none_are_cells_too() -> None:
+def test_times_before_1970_and_missing_times_can_be_written() -> None:
     assert time_cell(-0.5) == datetime(1969, 12, 31, 23, 59, 59, 500_000, UTC)
     assert time_cell(None) is None

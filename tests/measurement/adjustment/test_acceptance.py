@@ -93,7 +93,7 @@ MOVED = (0.0, 43.0, 88.0, 180.0)  # by less than half a dot
         for radius in (12.0, 40.0)
     ],
 )
-def test_other_dots_are_another_code(
+def test_wrong_dots_are_reported_as_another_code(
     fit_plate: FitPlate, code_deg: tuple[float, ...], radius_px: float
 ) -> None:
     fit = fit_plate(code_deg, radius_px)
@@ -110,7 +110,7 @@ def test_other_dots_are_another_code(
     ],
     ids=["outliers", "noise"],
 )
-def test_what_does_not_fit_is_refused(
+def test_a_poor_fit_is_refused(
     fit_plate: FitPlate, spoil: Callable[[TargetFit], TargetFit]
 ) -> None:
     with pytest.raises(Rejection) as caught:

@@ -66,7 +66,7 @@ def test_uneven_light_makes_variances_larger_than_residuals_show(
 
 
 @pytest.mark.parametrize("turn_deg", [31.0, 179.9])
-def test_deviations_are_the_scatter_of_poses_drawn_from_the_covariance(
+def test_deviations_equal_the_scatter_of_poses_drawn_from_the_covariance(
     camera: Camera, place_plate: PlacePlate, turn_deg: float
 ) -> None:
     pose = place_plate((80.0, 290.0), 25.0, tilt_deg=30.0, way_deg=70.0, turn_deg=turn_deg)

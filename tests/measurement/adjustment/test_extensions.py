@@ -53,7 +53,7 @@ def problem_of_unknown_tone() -> FitProblem:
         (True, 3.9, [Tone.UNKNOWN_OVER_LINE, Tone.UNKNOWN]),  # of fits beside the minimum, 3.9…5.7
     ],
 )
-def test_the_other_base_is_tried_where_levels_leave_residuals_that_agree(
+def test_the_other_base_is_tried_if_levels_leave_correlated_residuals(
     monkeypatch: pytest.MonkeyPatch, *, has_levels: bool, inflation: float, tones: list[Tone]
 ) -> None:
     tried = []
@@ -112,7 +112,7 @@ def test_only_a_fit_at_its_minimum_is_the_start_over_the_other_base(
     assert starts == [None, poses if is_start else None]
 
 
-def test_a_fit_that_leaves_the_pose_open_is_not_at_its_minimum(
+def test_a_fit_without_a_determined_pose_is_not_at_its_minimum(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def no_covariance(_: object) -> object:
@@ -367,7 +367,7 @@ def started_under(
 
 
 @pytest.mark.parametrize("tone", [Tone.LINEAR, Tone.SRGB])
-def test_fits_start_from_the_light_of_shadows_that_are_seen(
+def test_fits_start_from_the_light_of_visible_shadows(
     monkeypatch: pytest.MonkeyPatch, tone: Tone
 ) -> None:
     """What edges add is relative to the contrast of the light, which half in shade is half."""
@@ -391,7 +391,7 @@ def test_fits_start_from_the_light_of_shadows_that_are_seen(
         (Tone.UNKNOWN_OVER_LINE, 0.75, 1.0),  # the white that is seen is the scale
     ],
 )
-def test_ink_tells_how_bright_burnt_white_is(
+def test_the_step_on_ink_gives_the_start_value_of_burnt_white(
     monkeypatch: pytest.MonkeyPatch, tone: Tone, plate_in_shade: float, white: float
 ) -> None:
     rows = [[*STEP, -0.05, plate_in_shade - 1.0]]

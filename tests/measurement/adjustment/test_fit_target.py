@@ -105,7 +105,7 @@ def rms(values: FloatArray) -> float:
     ],
     ids=["comatic", "out of focus"],
 )
-def test_errors_of_small_rings_behind_other_spreads_are_as_large_as_reported(
+def test_errors_of_small_rings_with_other_point_spreads_are_as_reported(
     errors_of: Callable[..., Errors], optics: Optics
 ) -> None:
     """Residuals show skew or kurtosis, but too little to make them free: 2.0 and 1.9 without."""
@@ -154,7 +154,7 @@ def test_exposure_and_tone_do_not_move_the_distance(
 @pytest.mark.parametrize(
     ("tone", "base"), [(ToneCurve.SRGB, ToneBase.SRGB), (ToneCurve.FILM, ToneBase.LINE)]
 )
-def test_the_base_of_an_unknown_tone_is_told_by_the_same_pixels(
+def test_bases_of_an_unknown_tone_are_compared_on_the_same_pixels(
     photograph: Photograph, start_near: StartNear, tone: ToneCurve, base: ToneBase
 ) -> None:
     camera, rng = replace(LENS, response=Response.UNKNOWN), np.random.default_rng(7)
@@ -230,7 +230,7 @@ def test_a_base_whose_fit_is_refused_gives_way_to_the_other(
     assert rescued.rival is None
 
 
-def test_a_clipped_film_curve_is_read_to_some_hundredths_of_a_per_cent(
+def test_distances_under_a_clipped_film_curve_are_right_to_hundredths_of_a_percent(
     errors_of: Callable[..., Errors],
 ) -> None:
     """Three shapes of a curve whose shoulder is cut off say less: two deviations too long."""

@@ -31,7 +31,7 @@ BLACK, WHITE, RADIUS_M, SD_M, SLACK_M = 0.1, 0.8, 0.45, 0.02, 0.004
 
 @pytest.mark.parametrize(("white", "brightest"), [(0.8, 1.0), (1.3, 1.0), (1.3, 0.9)])
 @pytest.mark.parametrize("seed", range(3))
-def test_foreign_is_what_is_neither_plate_nor_the_edge_of_the_ring(
+def test_pixels_are_foreign_if_neither_plate_nor_ring_edge_explains_them(
     seed: int, white: float, brightest: float
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -59,7 +59,7 @@ def test_foreign_is_what_is_neither_plate_nor_the_edge_of_the_ring(
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_hidden_is_what_is_off_its_level_or_beyond_a_missing_edge(seed: int) -> None:
+def test_pixels_off_their_level_or_beyond_a_missing_edge_are_hidden(seed: int) -> None:
     rng = np.random.default_rng(seed)
     smooth, rho_m = rng.uniform(0.0, 1.0, PIXELS), rng.uniform(0.0, 0.6, PIXELS)
     share = rng.integers(0, 2, PIXELS).astype(np.float64)
@@ -86,7 +86,7 @@ def test_hidden_is_what_is_off_its_level_or_beyond_a_missing_edge(seed: int) -> 
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_levels_are_medians_of_the_third_that_is_clearest_of_edges(seed: int) -> None:
+def test_levels_are_medians_of_the_third_of_pixels_farthest_from_edges(seed: int) -> None:
     rng = np.random.default_rng(seed)
     levels, rho_m = rng.uniform(0.0, 1.0, PIXELS), rng.uniform(0.0, 0.6, PIXELS)
     share, edge_distance_m = rng.uniform(0.0, 1.0, PIXELS), rng.uniform(0.0, 0.1, PIXELS)
@@ -100,7 +100,7 @@ def test_levels_are_medians_of_the_third_that_is_clearest_of_edges(seed: int) ->
     )
 
 
-def test_without_ink_its_level_is_unknown() -> None:
+def test_the_level_of_ink_is_unknown_without_ink_pixels() -> None:
     one = np.ones(10)
     black, white = _median_levels(0.7 * one, 0.1 * one, one, one, RADIUS_M)
     assert math.isnan(black)

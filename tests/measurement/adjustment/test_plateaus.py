@@ -50,7 +50,7 @@ def look(
     return at
 
 
-def test_even_light_is_even(
+def test_even_light_is_recognised_as_even(
     look: Callable[..., tuple[FitProblem, Plateaus]], target: Target
 ) -> None:
     problem, plateaus = look(target)
@@ -59,7 +59,7 @@ def test_even_light_is_even(
     assert shadows_across(problem, plateaus) == []
 
 
-def test_levels_are_those_farther_off_where_no_plateau_is_near(
+def test_levels_come_from_distant_plateaus_if_none_is_near(
     look: Callable[..., tuple[FitProblem, Plateaus]],
     target: Target,
     place_plate: Callable[..., Pose],
@@ -115,7 +115,7 @@ def test_a_step_that_only_plate_shows_leaves_ink_as_it_is(
     ],
     ids=["shade", "shade on both", "glare", "mostly on ink", "against each other"],
 )
-def test_a_step_is_one_that_shade_or_glare_can_make(
+def test_steps_that_neither_shade_nor_glare_can_cause_are_rejected(
     look: Callable[..., tuple[FitProblem, Plateaus]],
     target: Target,
     *,
@@ -131,7 +131,7 @@ def test_a_step_is_one_that_shade_or_glare_can_make(
     assert bool(shadows_across(stepped, plateaus)) == is_light
 
 
-def test_ink_under_glare_is_ink(
+def test_ink_under_glare_is_not_taken_for_plate(
     target: Target,
     camera: Camera,
     place_plate: Callable[..., Pose],
@@ -211,7 +211,7 @@ def test_white_without_noise_below_the_end_of_the_range_is_burnt(
         assert without_burnt_white(told_too_little, plateaus) is told_too_little
 
 
-def test_burnt_white_is_seen_beside_shade(
+def test_burnt_white_is_recognised_beside_shade(
     look: Callable[..., tuple[FitProblem, Plateaus]],
     target: Target,
     place_plate: Callable[..., Pose],

@@ -65,7 +65,7 @@ def test_residuals_show_where_a_pose_is_too_near_or_beside(
 @pytest.mark.parametrize(
     ("radius_px", "way_deg", "turn_deg"), [(9.0, 0.0, 0.0), (11.0, 40.0, 30.0)]
 )
-def test_slight_shade_on_a_small_ring_is_seen(
+def test_slight_shade_on_a_small_ring_shows_in_the_residuals(
     camera: Camera,
     photograph: DrawFrame,
     place_plate: PlacePlate,

@@ -69,7 +69,7 @@ def percent_off(measurement: Measurement, truth: Pose) -> float:
     return 100.0 * (measurement.distance_m / truth.distance_m - 1.0)
 
 
-def test_smoothing_is_seen_and_that_of_all_frames_corrects_distances(
+def test_smoothing_is_estimated_and_the_flight_s_value_corrects_distances(
     smoothed: list[tuple[Measurement, Pose]],
 ) -> None:
     seen = [smoothing_of(measurement) for measurement, _ in smoothed]

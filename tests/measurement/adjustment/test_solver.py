@@ -34,7 +34,7 @@ def streaked_edge(at_px: FloatArray, sd_px: float, length_px: float) -> FloatArr
 
 @pytest.mark.parametrize("length_px", [2.5, 4.0, 7.0])
 @pytest.mark.parametrize("angle_deg", [-64.0, 21.0])
-def test_a_streak_is_read_from_the_gaussian_that_fits_its_edges(
+def test_the_start_of_a_streak_follows_from_the_gaussian_fitted_to_its_edges(
     length_px: float, angle_deg: float
 ) -> None:
     sd_px, at_px = 0.9, np.linspace(-14.0, 14.0, 561)

@@ -37,7 +37,7 @@ def check_distance(seen: Measurement, truth: Pose) -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 13, 20])
-def test_a_start_that_is_tilted_the_wrong_way_is_turned(
+def test_a_start_tilted_in_the_wrong_direction_is_corrected(
     photograph: Callable[..., GreyArray], start_near: Callable[..., InitialPose], seed: int
 ) -> None:
     """Three of these stayed near the tilt of 0, by 1.0 … 1.6 % too far away."""

@@ -60,7 +60,7 @@ def test_a_line_is_no_circle_and_an_empty_frame_has_none() -> None:
     assert near_circular(find_contours(frame, SETTINGS), SETTINGS) == ()
 
 
-def test_a_circle_that_a_notch_breaks_into_is_found_by_its_hull() -> None:
+def test_a_circle_with_a_notch_is_found_by_its_convex_hull() -> None:
     frame = drawn(Ellipse(150.0, 100.0, 30.0, 30.0, 0.0))
     frame[96:105, 150:190] = 200
     frame[60:100, 146:155] = 200

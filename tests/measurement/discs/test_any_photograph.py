@@ -72,7 +72,7 @@ def test_random_photographs_give_finite_results(
             assert np.linalg.eigvalsh(disc.cov)[0] > 0.0
 
 
-def test_read_only_and_deep_photographs_give_the_same(sharp: GreyArray) -> None:
+def test_read_only_and_16_bit_photographs_give_the_same_results(sharp: GreyArray) -> None:
     shallow = find_outlines(sharp)
     sharp.flags.writeable = False
     assert find_outlines(sharp) == shallow

@@ -62,7 +62,7 @@ def test_bent_curves_that_are_nearly_as_likely_are_compared_by_their_own_masks(
         (765.0, {Tone.UNKNOWN}),
     ],
 )
-def test_a_line_is_bent_itself_unless_srgb_s_curve_is_much_likelier(
+def test_the_line_is_bent_unless_bent_srgb_is_much_likelier(
     of_line: float, worthy: set[Tone]
 ) -> None:
     plain = [joint(Tone.SRGB, 1200.0), joint(Tone.LINEAR, 1000.0)]
@@ -192,7 +192,7 @@ def test_the_edge_of_a_shadow_does_not_bend_the_curve() -> None:
     assert camera.prior.mean[:4] == pytest.approx(np.zeros(4), abs=0.02)
 
 
-def test_a_disc_that_begins_far_off_does_not_run_away_from_all_others() -> None:
+def test_a_disc_with_a_bad_start_does_not_diverge() -> None:
     camera = Camera(260, 60, 2e5, 2e5, 129.5, 29.5)
     pose = Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
     places = (-90.0, -30.0, 30.0, 90.0)
@@ -216,7 +216,7 @@ def test_a_disc_that_begins_far_off_does_not_run_away_from_all_others() -> None:
     assert np.linalg.eigvalsh(together.precision)[0] > 0.0
 
 
-def test_a_state_by_another_curve_shows_the_same_grey_values() -> None:
+def test_a_state_converted_to_another_curve_has_the_same_grey_values() -> None:
     """It is where steps begin anew: levels that stayed would be other grey values."""
     vector = np.zeros(COUNT)
     vector[[Row.BLACK, Row.WHITE]] = 0.1, 0.62

@@ -86,7 +86,7 @@ def test_steps_are_those_of_the_file(quality: int) -> None:
     assert steps[0, 7] <= steps[7, 7] <= (121 * scale + 50) // 100
 
 
-def test_no_steps_are_read_from_what_was_not_compressed_or_was_moved() -> None:
+def test_no_steps_are_found_in_uncompressed_or_shifted_photographs() -> None:
     grey = small_discs(FILM, 4, 1)[0]
     assert quantisation_steps(grey) is None
     assert quantisation_steps(compressed(grey, 92)[3:, 5:]) is None
@@ -121,7 +121,7 @@ def test_no_steps_are_read_from_blocks_that_begin_elsewhere(blur_px: float, qual
     assert again[0, :3].tolist() == [3.0, 2.0, 2.0]  # those of quality 90
 
 
-def test_levels_before_compression_are_nearer_to_what_they_were() -> None:
+def test_estimated_levels_before_compression_are_nearer_to_the_true_ones() -> None:
     """By the model of the very disc: 3.8 grey values instead of 5.3; stated 2.8."""
     grey = small_discs(FILM, 5, 1)[0]
     photo = compressed(grey, 75)
@@ -147,7 +147,7 @@ def fits_of(photo: GreyArray, outlined: GreyArray) -> list[DiscFit]:
     return [adjust_disc(DiscTask(photo, outline, []), free) for outline in outlines]
 
 
-def test_the_likelihood_of_coefficients_falls_as_its_derivatives_say() -> None:
+def test_the_likelihood_of_coefficients_agrees_with_its_derivatives() -> None:
     """Of the whole disc, with pixels that tell for themselves at the photograph's border."""
     grey = small_discs(FILM, 5, 1)[0][:, :126]
     photo = compressed(grey, 75)
@@ -177,7 +177,7 @@ def test_the_likelihood_of_coefficients_falls_as_its_derivatives_say() -> None:
         assert (totals[0] - totals[1]) / (2.0 * step) == pytest.approx(slope, rel=0.02, abs=0.5)
 
 
-def test_a_coefficient_tells_no_more_than_its_interval() -> None:
+def test_a_coefficient_contributes_only_the_information_of_its_interval() -> None:
     """Nothing within a wide one; as much as a value once it is narrow; outliers little."""
     photo = compressed(small_discs(FILM, 5, 1)[0], 92)
     places = np.mgrid[16:24, 16:24].reshape(2, -1)[::-1].astype(np.float64)
@@ -263,7 +263,7 @@ def test_film_s_curve_is_recognised_where_discs_contradict_each_other(seed: int)
     ("response", "curve", "gain"),
     [(Response.SRGB, ToneCurve.SRGB, 1.0), (Response.LINEAR, ToneCurve.LINEAR, 2.4)],
 )
-def test_radii_by_a_stated_curve_are_as_good_as_they_say(
+def test_radii_under_a_stated_curve_are_as_accurate_as_stated(
     response: Response, curve: ToneCurve, gain: float
 ) -> None:
     """JPEG displaces edges of sRGB by 0.03 px and burnt ones by 0.18 px: 5 deviations of noise."""
@@ -275,7 +275,7 @@ def test_radii_by_a_stated_curve_are_as_good_as_they_say(
     assert 0.3 < np.sqrt(np.mean(np.square(z))) < 1.3
 
 
-def test_compression_leaves_centres_where_they_are_in_light_that_falls_off() -> None:
+def test_compression_does_not_displace_centres_in_uneven_light() -> None:
     """A curve that may bend in each disc takes up JPEG's displacement: of 0.004 px here."""
     photos, truth = stated_photographs(ToneCurve.SRGB, 1.0, radius_px=110.0, side=2, fall=0.06)
     off = errors_of(photos, truth, Response.SRGB)

@@ -48,7 +48,7 @@ def alone(ratio: float) -> float:
     return float(inflations([scatter(ratio)])[0])
 
 
-def test_of_an_excess_by_chance_a_third_is_left() -> None:
+def test_only_a_third_of_a_chance_excess_counts() -> None:
     chance = np.random.default_rng(3).normal(0.0, 0.3, 20_000)
     left = beyond_chance(chance, np.full(len(chance), 0.09))
     assert left.mean() / 0.3 == pytest.approx(0.13, abs=0.01)
@@ -65,13 +65,13 @@ def test_one_disc_is_inflated_by_what_its_arcs_show_beyond_chance() -> None:
     assert alone(0.6) == alone(1.0) == 1.0
 
 
-def test_what_all_discs_of_a_photograph_show_is_no_chance() -> None:
+def test_an_excess_common_to_all_discs_of_a_photograph_counts_in_full() -> None:
     ratios = 1.4 * np.random.default_rng(5).chisquare(ARCS, 200) / ARCS
     assert 1.3 < np.mean(inflations([scatter(each) for each in ratios])) < 1.42
     assert inflations([]).shape == (0,)
 
 
-def test_a_whole_photograph_shows_that_noise_cancels() -> None:
+def test_ratios_below_one_count_if_the_whole_photograph_shows_them() -> None:
     ratios = 0.6 * np.random.default_rng(7).chisquare(ARCS, 100) / ARCS
     ratios[:3] = 20.0  # clutter
     scatters = [scatter(each) for each in ratios]
@@ -84,7 +84,7 @@ def test_a_whole_photograph_shows_that_noise_cancels() -> None:
     assert np.median(inflations(others)) == 1.0
 
 
-def test_what_cancels_over_blocks_counts_if_all_discs_show_it() -> None:
+def test_cancellation_over_blocks_counts_if_all_discs_show_it() -> None:
     rng = np.random.default_rng(9)
     ratios = 0.8 * rng.chisquare(ARCS, 100) / ARCS
     over_arcs = inflations([scatter(each) for each in ratios])
@@ -133,7 +133,7 @@ def test_jpegs_blocks_show_how_much_of_its_errors_cancels() -> None:
     assert np.mean(aside) > 1.05 * np.mean(stated)  # blocks that begin elsewhere show less of it
 
 
-def test_deviations_of_mostly_clipped_discs_are_true() -> None:
+def test_deviations_of_mostly_clipped_discs_agree_with_their_errors() -> None:
     """Small dark discs on burnt ground: twelve unknowns from some twenty pixels."""
     camera, pose = Camera(110, 70, 2e5, 2e5, 54.5, 34.5), Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
     lattice = 20.0 * np.array([(i, j) for i in range(-2, 3) for j in (-1, 0, 1)])
@@ -158,7 +158,9 @@ def test_deviations_of_mostly_clipped_discs_are_true() -> None:
 
 
 @pytest.mark.parametrize(("gain", "is_burnt"), [(1.0, False), (1.5 / 0.62, True)])
-def test_only_edges_tell_the_noise_of_a_burnt_disc(*, gain: float, is_burnt: bool) -> None:
+def test_the_noise_of_a_burnt_disc_is_estimated_from_its_edge_only(
+    *, gain: float, is_burnt: bool
+) -> None:
     camera, pose = Camera(40, 40, 2e5, 2e5, 19.5, 19.5), Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
     scene = FieldScene((SimulatedDisc((1.5e-6, 1e-6, 0.0), 10.0 / 2e5),), 0.62, 0.1)
     rng = np.random.default_rng(8)
@@ -184,7 +186,7 @@ def test_a_disc_with_too_few_unclipped_pixels_is_refused() -> None:
     assert "unclipped pixels for" in outcome.detail
 
 
-def test_the_radius_of_a_disc_alone_is_as_good_as_it_says() -> None:
+def test_the_radius_of_a_single_disc_is_as_accurate_as_stated() -> None:
     """Chance alone had its deviation stated 8 % too large."""
     camera = Camera(260, 260, 20_000.0, 20_000.0, 129.5, 129.5)
     places = [np.array([column, row]) * 42.0 for row in range(-2, 3) for column in range(-2, 3)]

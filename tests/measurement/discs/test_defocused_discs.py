@@ -82,7 +82,7 @@ def test_radii_out_of_focus_are_right(
     assert -1.2 < kurtosis < -0.4
 
 
-def test_radii_of_burnt_discs_out_of_focus_are_as_good_as_they_say() -> None:
+def test_radii_of_burnt_discs_out_of_focus_are_as_accurate_as_stated() -> None:
     """Without what focus does to burnt edges, they were off by 1.6 deviations."""
     errors, sds, _ = radius_errors_px(2.0, ToneCurve.LINEAR, Response.LINEAR, 1.5 / 0.62)
     assert 0.4 < np.sqrt(np.mean((errors / sds) ** 2)) < 1.35

@@ -49,7 +49,7 @@ def test_derivatives_contain_changes_of_sharpened_neighbours(tone: Tone) -> None
         assert np.abs(jacobian[row] - slopes).max() < 2e-3 * max(np.abs(slopes).max(), 0.1)
 
 
-def test_table_is_srgb() -> None:
+def test_the_tabulated_curve_equals_srgb() -> None:
     values = vector()
     values[Row.SLOPE_X :] = 0.0
     found, _ = levels(Tone.SRGB, values)
@@ -58,7 +58,7 @@ def test_table_is_srgb() -> None:
 
 
 @pytest.mark.parametrize("tone", [Tone.UNKNOWN, Tone.UNKNOWN_OVER_LINE])
-def test_light_is_found_of_every_level(tone: Tone) -> None:
+def test_every_level_can_be_converted_to_light(tone: Tone) -> None:
     curve = DiscTone(tone, (0.2, -0.6, 0.1))
     light = np.linspace(-0.1, 1.6, 50)
     assert curve.light(curve.levels(light)) == pytest.approx(light, abs=1e-9)
@@ -75,7 +75,7 @@ def test_curves_rise_everywhere() -> None:
 
 
 @pytest.mark.parametrize("tone", [Tone.UNKNOWN, Tone.UNKNOWN_OVER_LINE])
-def test_curves_do_not_make_darks_darker(tone: Tone) -> None:
+def test_curves_do_not_darken_dark_light(tone: Tone) -> None:
     """Than a straight line, by more than an error of the black level; steep curves can."""
     waves = np.array((-1.04, 0.63, -0.25) if tone.is_srgb else (-0.6, 0.0, 0.0))
     light = np.linspace(0.02, 0.4, 39)

@@ -31,7 +31,7 @@ def tasks(radius_px: float, count: int = 60) -> list[DiscTask]:
 @pytest.mark.parametrize(
     ("radius_px", "least", "most"), [(3.5, 29, 32), (6.0, 17, 20), (14.0, 9, 9)]
 )
-def test_small_discs_are_learned_from_in_number(
+def test_more_discs_are_learned_from_if_they_are_small(
     radius_px: float, least: int, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of discs below 5 px nine, as of large ones: more of them do not tell tone from blur."""

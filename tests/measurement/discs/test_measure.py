@@ -91,7 +91,7 @@ def nearest(centres: FloatArray, moments: FloatArray) -> IndexArray:
 
 
 @pytest.mark.parametrize(("light", "sharpening"), [(0.7, 1.0), (1.3, 0.6)])
-def test_what_sharpening_leaves_beside_edges_hides_no_disc(light: float, sharpening: float) -> None:
+def test_overshoots_of_sharpening_hide_no_disc(light: float, sharpening: float) -> None:
     """It was taken for a hole, and discs were measured without their ink."""
     rendered = sharpened(light, sharpening)
     outlines = find_outlines(rendered.photo)
@@ -139,7 +139,7 @@ def test_all_discs_and_holes_are_found(field: str, request: pytest.FixtureReques
 
 
 @pytest.mark.parametrize("field", ["dark", "bright"])
-def test_moments_are_as_good_as_they_say(field: str, request: pytest.FixtureRequest) -> None:
+def test_moments_are_as_accurate_as_stated(field: str, request: pytest.FixtureRequest) -> None:
     rendered = request.getfixturevalue(field)
     outlines = outer(find_outlines(rendered.photo))
     discs = measure_discs(rendered.photo, outlines, response=Response.LINEAR)
@@ -159,7 +159,7 @@ def test_moments_are_as_good_as_they_say(field: str, request: pytest.FixtureRequ
     assert outside == pytest.approx(0.7 if field == "dark" else 0.1, abs=0.01)
 
 
-def test_holes_are_measured_as_circles_of_their_own(dark: Rendered) -> None:
+def test_holes_are_measured_as_separate_circles(dark: Rendered) -> None:
     photo, truth = dark.photo, dark.moments[dark.rings]
     outlines = find_outlines(photo)
     holes = [i for i, each in enumerate(outlines) if each.is_hole]
@@ -206,7 +206,7 @@ def test_predicted_outlines_are_followed(dark: Rendered) -> None:
     assert follow_outlines(photo, []) == ()
 
 
-def test_what_cannot_be_measured_says_why(dark: Rendered) -> None:
+def test_discs_that_cannot_be_measured_have_a_reason(dark: Rendered) -> None:
     photo, moments = dark.photo, dark.moments
     outline = DiscOutline.predicted(ellipse_of_moments(moments[0]), Polarity.DARK)
 
@@ -227,7 +227,9 @@ def test_what_cannot_be_measured_says_why(dark: Rendered) -> None:
     assert reason(swapped) is DiscReason.NO_CONTRAST
 
 
-def test_light_does_not_fall_off_over_a_small_disc(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_prior_keeps_the_gradient_over_a_small_disc_small(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Where the ground is burnt, only that keeps its gradient from displacing the centre."""
     discs = tuple(
         SimulatedDisc((0.012 * i, 0.012 * j, 0.0), 0.006)
@@ -317,7 +319,7 @@ def test_noise_about_a_wrong_model_of_a_burnt_disc_is_not_small(
 
 
 @pytest.mark.parametrize("response", list(Response))
-def test_a_disc_of_which_no_pixel_is_left_is_refused(
+def test_a_disc_without_usable_pixels_is_refused(
     response: Response, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On ground with texture all pixels of a window may be taken for something else."""
@@ -364,7 +366,9 @@ def rms_and_sd_px(photo: GreyArray, truth: FloatArray) -> tuple[float, float]:
     return float(np.sqrt(np.mean(off**2))), float(np.sqrt(0.5 * np.mean(variances)))
 
 
-def test_discs_under_the_edge_of_a_shadow_are_known_well(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_discs_under_the_edge_of_a_shadow_are_measured_accurately(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The photographer's shadow: light of first order leaves residuals, which count as errors."""
     photo, truth = under_shadows(0.3, 24.0, 10.0)
     rms_px, sd_px = rms_and_sd_px(photo, truth)
@@ -394,7 +398,7 @@ def test_light_beyond_the_second_order_counts_as_an_error(monkeypatch: pytest.Mo
     assert 1.1 < sd_px / rms_and_sd_px(photo, truth)[1] < 1.5
 
 
-def test_curved_light_is_estimated_from_a_small_chi2_on(
+def test_light_of_second_order_is_used_from_its_chi2_limit_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     photo, truth = under_shadows(0.3, 12.0, 0.0)

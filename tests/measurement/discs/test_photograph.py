@@ -11,14 +11,14 @@ from kgcp.measurement.discs.photograph import _are_in_one_row
 
 
 @pytest.mark.parametrize(("beside", "is_row"), [(0, True), (1, True), (2, False)])
-def test_a_row_with_one_disc_beside_it_is_a_row(beside: int, *, is_row: bool) -> None:
+def test_a_row_with_a_single_disc_beside_it_counts_as_a_row(beside: int, *, is_row: bool) -> None:
     points_m = np.zeros((9, 3))
     points_m[:, 0] = np.arange(9.0)
     points_m[:beside, 1] = 0.5
     assert _are_in_one_row(points_m) is is_row
 
 
-def test_the_discs_of_large_fields_are_compared_with_a_line_in_little_memory() -> None:
+def test_testing_whether_discs_are_in_a_row_needs_little_memory() -> None:
     """Matrices of every disc with every other one, for each that is left out, took seconds."""
     points_m = np.random.default_rng(1).normal(size=(300, 3))
     tracemalloc.start()

@@ -76,7 +76,7 @@ def measured(grey: GreyArray, pose: Pose, polarity: Polarity, *, is_even: bool) 
     return disc
 
 
-def test_texture_is_found_as_it_was_drawn() -> None:
+def test_texture_parameters_are_those_it_was_simulated_with() -> None:
     rng, found = np.random.default_rng(3), []
     rows, columns = np.divmod(np.arange(WIDTH * HEIGHT), WIDTH)
     places_px = np.stack((columns, rows)).astype(np.float64)
@@ -94,7 +94,7 @@ def test_texture_is_found_as_it_was_drawn() -> None:
     assert 0.9 < np.mean([each.sd for each in found]) / SD < 1.1
 
 
-def test_covariance_is_as_far_as_pixels_see_the_ground() -> None:
+def test_covariance_is_scaled_by_how_far_pixels_see_the_ground() -> None:
     texture = GroundTexture(0.1, 2.0)
     cov = texture.cov(np.array([[0.0, 2.0], [2.0, 0.0]]), np.array([1.0, 0.5]))
     neighbours = 0.01 * 0.5 * 2.0 * math.exp(-1.0)
@@ -128,7 +128,7 @@ def test_errors_are_smaller_and_as_stated(
     assert 2.5 < float(np.median(squares)) < 7.0
 
 
-def test_stones_at_the_edge_are_in_the_deviations() -> None:
+def test_deviations_cover_stones_at_the_edge() -> None:
     """They are no texture; taken for one, errors would be 1.6 times what is stated."""
     rng, normalised = np.random.default_rng(7), []
     for _ in range(20):
@@ -183,7 +183,7 @@ def test_a_large_disc_on_two_kinds_of_ground_is_stated_no_better_than_by_pixels(
     [(DARK, Polarity.DARK, 1.1, 1.0), (BRIGHT, Polarity.BRIGHT, 0.3, 2.0)],
     ids=["ground", "disc"],
 )
-def test_what_is_burnt_is_not_measured_by_texture(
+def test_burnt_discs_are_measured_without_a_texture_model(
     target: PlainTarget, polarity: Polarity, level: float, gain: float
 ) -> None:
     rng = np.random.default_rng(6)

@@ -176,7 +176,7 @@ def test_every_rule_approximates_its_integral(
     assert np.abs(disc.level(x, y) - by_chords(disc, x, y, 900)).max() < tolerance
 
 
-def test_series_of_the_normal_distribution() -> None:
+def test_the_normal_distribution_s_polynomials_are_accurate() -> None:
     z = np.linspace(0.0, FAR, 2001)
     density = np.polynomial.Polynomial(EXPONENTIAL)(0.5 * z * z / 2**SQUARINGS) ** (2**SQUARINGS)
     density /= np.sqrt(2.0 * np.pi)
@@ -260,7 +260,7 @@ def test_derivatives_of_an_edge_under_an_even_blur_are_those_of_the_level() -> N
         (24.0, (0.9, 0.9, 0.0, 0.2, 0.1)),
     ],
 )
-def test_an_edge_bends_under_oblique_blur_as_chords_say(
+def test_the_closed_form_under_oblique_blur_agrees_with_chords(
     radius: float, blur: tuple[float, float, float, float, float]
 ) -> None:
     """Blur or motion across the radius that goes with such along it."""
@@ -285,7 +285,7 @@ def test_a_streak_equals_the_mean_of_shifted_discs(radius: float, length: float)
     assert np.abs(disc.level(x, y) - expected).max() < 4e-4
 
 
-def test_anisotropic_blur_against_random_shifts() -> None:
+def test_anisotropic_blur_equals_the_mean_of_randomly_shifted_discs() -> None:
     """A disc shifted by random blur: the share of shifts that cover a point is its level."""
     rng = np.random.default_rng(5)
     covariance = np.array([[0.9, 0.5], [0.5, 1.6]])

@@ -143,7 +143,7 @@ def test_levels_are_those_of_a_finely_sampled_blurred_plate(distance_m: float) -
     ("radius_px", "distance_m", "share_left"),
     [(1.5, 60.0, 0.65), (2.0, 60.0, 0.4), (2.0, 120.0, 0.45)],
 )
-def test_kurtosis_is_most_of_what_a_disc_of_light_differs_from_a_gaussian(
+def test_kurtosis_explains_most_of_the_difference_of_defocus_from_a_gaussian(
     radius_px: float, distance_m: float, share_left: float
 ) -> None:
     pose = Pose(POSE.rotation, POSE.translation_m * (distance_m / POSE.distance_m))
@@ -174,7 +174,7 @@ def test_kurtosis_is_most_of_what_a_disc_of_light_differs_from_a_gaussian(
 
 
 @pytest.mark.parametrize("streak", [(0.0, 0.0), (3.0, -2.0)])
-def test_rules_hold_on_a_steep_plate(streak: tuple[float, float]) -> None:
+def test_quadrature_rules_hold_on_a_strongly_tilted_plate(streak: tuple[float, float]) -> None:
     """Where a pixel spans half as much again along the tilt as across it."""
     turn = Rotation.from_euler("xyz", [40.0, 25.0, 70.0], degrees=True).as_matrix()
     pose = Pose(turn, POSE.translation_m * 1.6)

@@ -91,7 +91,7 @@ def test_clipped_pixels_have_derivatives_of_their_tail(high: bool) -> None:  # n
     )
 
 
-def test_clipped_pixels_say_only_at_least() -> None:
+def test_clipped_pixels_do_not_penalise_brighter_models() -> None:
     model = np.array([1.3, 1.1, 0.9])
     result = misfit(np.ones(3), model, np.full(3, 0.02), all_clipped(3, high=True))
     np.testing.assert_allclose(result.score[:2], 0.0, atol=1e-4)
@@ -208,7 +208,9 @@ def test_ink_is_no_noisier_than_plate_for_noisy_edges() -> None:
 
 
 @pytest.mark.parametrize(("factor", "low", "high"), [(1.0, 1.0, 1.1), (3.0, 2.5, 3.3)])
-def test_edges_have_the_scatter_they_show(factor: float, low: float, high: float) -> None:
+def test_noise_at_edges_is_raised_to_the_scatter_of_edges(
+    factor: float, low: float, high: float
+) -> None:
     residuals, share = scattered(np.random.default_rng(7), factor)
     noise = estimate_noise(residuals, share, np.full(1200, fill_value=True), COUNT)
     middle = np.abs(share - 0.5) < 0.1
@@ -216,7 +218,7 @@ def test_edges_have_the_scatter_they_show(factor: float, low: float, high: float
     np.testing.assert_allclose(noise.sd[:600], noise.plateau_sd[:600])
 
 
-def test_a_few_wild_pixels_and_clipped_ones_do_not_count() -> None:
+def test_outliers_and_clipped_pixels_do_not_change_the_noise() -> None:
     residuals, share = scattered(np.random.default_rng(8), 1.0)
     usable = np.full(1200, fill_value=True)
     plain = estimate_noise(residuals, share, usable, COUNT)
@@ -295,7 +297,7 @@ def test_levels_near_the_limit_beside_edges_alone_are_not_smeared(*, burnt: bool
         assert np.isfinite(is_limited) == smears
 
 
-def test_a_noisy_plate_just_below_saturation_is_seen() -> None:
+def test_a_noisy_plate_just_below_saturation_is_not_clipped() -> None:
     """Some of its pixels are clipped; the others show its level."""
     rng = np.random.default_rng(6)
     counts = np.minimum(np.rint(rng.normal(252.0, 3.0, 2000)), 255.0)

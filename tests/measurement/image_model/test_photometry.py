@@ -238,7 +238,7 @@ def test_light_after_a_step_has_the_predicted_levels(
     np.testing.assert_allclose(apply_tone(moved, after(1.0).values), promised, atol=1e-6)
 
 
-def test_light_just_moves_where_the_tone_curve_is_flat() -> None:
+def test_light_takes_the_plain_step_where_the_tone_curve_is_flat() -> None:
     flat = Light(0.1, 0.8, tone_1=1.0)  # its slope is 0 at the plate
     x, step = np.array([0.2, 1.0]), np.array([0.01, 0.01])
     moved = light_after_step(x, step, Light(0.1, 0.8).values, flat.values)
@@ -288,7 +288,7 @@ def test_steps_add_to_every_parameter_in_order() -> None:
     np.testing.assert_allclose(moved.vector, start.vector + step)
 
 
-def test_a_step_never_leaves_a_blur_that_cannot_be() -> None:
+def test_steps_never_lead_to_an_impossible_blur() -> None:
     start = Parameters.of(Pose(np.eye(3), np.array([0.0, 0.0, 9.0])), Blur(0.6, 0.4, 0.05), LIGHT)
     for mean, difference, xy in ((-3.0, 0.0, 0.0), (0.0, 2.0, 1.0), (-0.3, -5.0, 3.0)):
         step = np.zeros(PARAM_COUNT)
@@ -309,7 +309,7 @@ FILM = Light(0.0, 1.0, tone_1=0.73, tone_2=0.34, tone_3=-0.78)  # as of sRGB's c
         (Tone.UNKNOWN, Tone.UNKNOWN, LIGHT),
     ],
 )
-def test_over_another_base_a_curve_keeps_its_grey_values(
+def test_a_curve_converted_to_another_base_keeps_its_grey_values(
     tone: Tone, other: Tone, light: Light
 ) -> None:
     share = np.linspace(0.0, 1.0, 41)

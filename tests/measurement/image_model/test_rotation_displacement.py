@@ -48,7 +48,7 @@ def drawn(pose: Pose, count: int) -> FloatArray:
     return pose_displacements(pose, CIRCLES, DELAY_S, rotations)
 
 
-def test_without_a_rotation_a_pose_stays() -> None:
+def test_without_rotation_the_pose_is_unchanged() -> None:
     off = pose_displacements(facing(12.0), CIRCLES, DELAY_S, np.zeros((2, 3)))
     assert_allclose(off, 0.0, atol=1e-9)
 
@@ -66,7 +66,7 @@ def test_an_image_stretched_along_the_foreshortened_axis_seems_less_tilted() -> 
 
 
 @pytest.mark.parametrize("tilt_deg", [8.0, 15.0, 30.0])
-def test_a_rotation_that_becomes_known_leads_back(tilt_deg: float) -> None:
+def test_correcting_a_known_rotation_restores_the_true_pose(tilt_deg: float) -> None:
     """From the pose that was measured without it, to the one that it hid."""
     pose = facing(tilt_deg)
     rotation = np.array([[0.08, -0.06, 0.05]])
@@ -92,7 +92,7 @@ def test_the_mean_square_is_that_of_many_rotations(tilt_deg: float) -> None:
     assert_allclose(stated / np.outer(sd, sd), expected / np.outer(sd, sd), atol=0.25)
 
 
-def test_derivatives_alone_would_not_do() -> None:
+def test_first_derivatives_alone_understate_the_covariance() -> None:
     """Of a plate that nearly faces the camera, the median of Mahalanobis distances tells."""
     pose = facing(6.0)
     off = drawn(pose, 2000)

@@ -83,7 +83,7 @@ def test_a_strip_has_two_edges_and_hides_nothing() -> None:
     assert seen.edges.rows[:, 4] == pytest.approx([-0.375, 0.375], abs=0.02)
 
 
-def test_a_strip_is_told_from_the_shade_that_it_runs_into() -> None:
+def test_a_strip_is_distinguished_from_the_shade_that_it_runs_into() -> None:
     """The edge comes first, although the strip adds to what it explains."""
     first, both = find_shadows(flat_under([EDGE], STRIP), Tone.LINEAR)
     assert (first.edges.single_count, len(first.edges.rows)) == (1, 1)
@@ -101,7 +101,7 @@ def test_where_white_is_burnt_on_either_side_ink_shows_the_shadow() -> None:
     assert seen.edges.rows[0, 3] == pytest.approx(-0.048, abs=0.003)
 
 
-def test_a_highlight_beside_which_white_is_burnt_too_is_no_shade() -> None:
+def test_a_highlight_beside_burnt_white_is_not_taken_for_shade() -> None:
     """It adds to ink what it adds to white, which is not seen."""
     flat = flat_under([EDGE], [], ink=0.5, plate=1.9, left=0.4)
     assert find_shadows(flat, Tone.LINEAR) == []
@@ -124,7 +124,7 @@ def test_ink_that_is_brighter_than_plate_is_in_no_shade() -> None:
     assert find_shadows(flat_under([EDGE], [], ink=0.7, plate=0.2), Tone.LINEAR) == []
 
 
-def test_the_step_that_is_found_explains_most_of_all() -> None:
+def test_the_step_that_explains_most_is_found() -> None:
     """Against sums over every pair of borders, by masks."""
     rng = np.random.default_rng(8)
     offsets, kind = rng.uniform(-RADIUS_PX, RADIUS_PX, (2, 300)), rng.integers(0, 2, 300)

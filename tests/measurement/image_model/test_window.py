@@ -76,7 +76,7 @@ def test_windows_are_cut_at_the_frame_s_border(
 @pytest.mark.parametrize(
     "centre_px", [(-12.0, -10.0), (-60.0, 180.0), (240.0, 700.0), (495.0, 370.0)]
 )
-def test_too_little_within_the_frame_is_a_rejection(
+def test_a_target_mostly_outside_the_frame_is_rejected(
     camera: Camera, place_plate: PlacePlate, centre_px: tuple[float, float]
 ) -> None:
     with pytest.raises(Rejection) as caught:

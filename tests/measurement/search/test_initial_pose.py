@@ -42,7 +42,7 @@ def started(
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 25.0])
 @pytest.mark.parametrize("radius_px", [14.0, 60.0])
-def test_an_outline_gives_a_pose_to_a_per_cent_or_two(
+def test_the_pose_from_an_outline_is_right_to_two_percent(
     radius_px: float, tilt_deg: float, started: Callable[..., tuple[InitialPose, Pose]]
 ) -> None:
     seen, pose = started(radius_px, tilt_deg)

@@ -80,7 +80,7 @@ def test_a_disc_on_dark_ground_is_no_ring() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_of_circles_that_are_alike_the_clearest_is_kept(seed: int) -> None:
+def test_only_the_clearest_of_similar_circles_is_kept(seed: int) -> None:
     rng = np.random.default_rng(seed)
     centres, radii = rng.uniform(0.0, 60.0, (90, 2)), rng.uniform(5.0, 15.0, 90)
     clearness = rng.random(90)

@@ -128,7 +128,7 @@ def test_rings_equal_those_of_a_plain_implementation(level: int, seed: int) -> N
 
 
 @pytest.mark.parametrize("third", [0, 1])
-def test_beyond_its_border_the_image_repeats_its_last_pixels(third: int) -> None:
+def test_samples_beyond_the_border_repeat_the_last_pixels(third: int) -> None:
     coarser = 2.0 + third
     frame = np.full((210, 290), WHITE, dtype=np.uint8)
     for factor, level in ((1.0, BLACK), (0.5, WHITE)):

@@ -92,7 +92,7 @@ def test_the_smallest_images_can_be_searched(shape: tuple[int, int]) -> None:
     assert peaks_of(np.zeros(shape, dtype=np.uint8)).shape == (0, 4)
 
 
-def test_of_too_many_peaks_the_clearest_are_kept() -> None:
+def test_only_the_clearest_of_too_many_peaks_are_kept() -> None:
     rng = np.random.default_rng(2)
     image = np.clip(rng.normal(120.0, 40.0, (400, 500)), 0, 255).astype(np.uint8)
     kept, upper = peaks_of(image), peaks_of(image[:150])
@@ -102,7 +102,7 @@ def test_of_too_many_peaks_the_clearest_are_kept() -> None:
     assert {tuple(peak) for peak in clear} <= {tuple(peak) for peak in kept}
 
 
-def test_of_too_many_peaks_that_are_alike_the_first_are_kept() -> None:
+def test_only_the_first_of_too_many_equal_peaks_are_kept() -> None:
     image = np.full((400, 2400), 60, dtype=np.uint8)
     for row, column in np.ndindex(3, 3):
         image[8 + row :: 12, 8 + column :: 12] = 200

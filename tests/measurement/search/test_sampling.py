@@ -21,7 +21,7 @@ def test_grey_values_between_pixels_are_bilinear_to_a_thirty_second_of_a_pixel()
     assert np.abs(sample_grey(RAMP, points) - expected).max() < (70.0 + 3.0) / 64.0 + 0.6
 
 
-def test_beyond_its_border_a_frame_repeats_its_last_pixels() -> None:
+def test_samples_beyond_the_border_repeat_the_last_pixels() -> None:
     points = np.array([[[-9.0, 40.0], [500.0, 40.0], [60.0, -1.0], [60.0, 95.0]]])
     within = np.clip(points, 0.0, (129.0, 89.0))
     assert sample_grey(RAMP, points) == pytest.approx(sample_grey(RAMP, within))
@@ -38,5 +38,5 @@ def test_ellipses_are_sampled_where_their_points_are() -> None:
         assert np.abs(seen - sample_grey(RAMP, points)).max() <= 73.0 / 32.0 + 1.0
 
 
-def test_no_ellipse_gives_no_values() -> None:
+def test_sampling_no_ellipses_gives_no_values() -> None:
     assert sample_ellipses(RAMP, (), np.ones(2), CIRCLE).shape == (0, 2, len(CIRCLE))

@@ -115,7 +115,7 @@ def test_the_visible_part_of_a_ring_fits_as_well_as_all_of_it(target: Target, fi
 
 
 @pytest.mark.parametrize("turn", [0, 11, 50, 87])
-def test_along_the_code_circle_a_code_is_told_from_stripes(target: Target, turn: int) -> None:
+def test_stripes_do_not_match_the_code_along_the_code_circle(target: Target, turn: int) -> None:
     ring, rows = target.ring, len(templates_of(target.ring).weights)
     patch, visible = np.zeros((rows + 2 * SHIFTS, ANGLES)), np.arange(ANGLES) < 85
     patch[2 : 2 + rows] = np.roll(templates_of(ring).images[5], turn, axis=1)

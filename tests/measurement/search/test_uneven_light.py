@@ -51,12 +51,14 @@ def test_a_highlight_on_a_ring_is_corrected(target: Target) -> None:
 
 
 @pytest.mark.parametrize("code_deg", [(0.0, 43.0, 78.0, 180.0, 260.0), (0.0, 43.0, 180.0)])
-def test_another_code_in_shade_is_another_code(target: Target, code_deg: tuple[float, ...]) -> None:
+def test_another_code_in_shade_is_not_taken_for_the_target(
+    target: Target, code_deg: tuple[float, ...]
+) -> None:
     shown = replace(target.ring, code_deg=code_deg)
     assert not match_templates(patch_of(shown, half_in_shade()), target.ring, 40.0).is_clear
 
 
-def test_small_rings_are_taken_to_be_in_even_light(target: Target) -> None:
+def test_the_light_on_small_rings_is_not_corrected(target: Target) -> None:
     patch = patch_of(target.ring, half_in_shade())
     assert match_templates(patch, target.ring, 8.5).is_clear
     assert not match_templates(patch, target.ring, 7.5).is_clear

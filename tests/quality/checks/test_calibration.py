@@ -40,7 +40,7 @@ def test_other_units_and_sizes_are_named(numbers: dict[str, Any], code: Cause, w
     assert words in str(doubt)
 
 
-def test_an_upright_calibration_is_told() -> None:
+def test_a_calibration_of_upright_frames_is_reported() -> None:
     (doubt,) = check_camera(Camera(900, 1350, 1903.0, 1903.0, 672.0, 440.0))
     assert "exchange cx and cy" in doubt.remedy
 
@@ -49,7 +49,7 @@ def test_an_upright_calibration_is_told() -> None:
     ("diameter", "words"),
     [(35.4, "0.899 m if it is in inches"), (90.0, "0.9 m if it is in centimetres"), (0.009, "")],
 )
-def test_diameters_of_other_units_are_told(diameter: float, words: str) -> None:
+def test_diameters_in_other_units_are_reported(diameter: float, words: str) -> None:
     ring = Ring("A", diameter, diameter / 2, diameter / 1.4, diameter / 7, (0.0, 43.0))
     (doubt,) = check_plates([Target(ring)])
     assert doubt.code is Cause.DIAMETERS
@@ -68,7 +68,7 @@ def test_diameters_of_other_units_are_told(diameter: float, words: str) -> None:
         (0.7, 0.57, 6, ""),
     ],
 )
-def test_layouts_that_the_search_misses_are_told(
+def test_layouts_that_the_search_cannot_find_are_reported(
     ratio: float, dot_share: float, dots: int, words: str
 ) -> None:
     code_deg = tuple(60.0 * k + k for k in range(dots))

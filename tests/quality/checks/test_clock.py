@@ -24,7 +24,7 @@ def test_frames_within_the_trajectory_raise_no_doubt() -> None:
     assert not [*check_overlap(np.array([]), TRAJECTORY_S, 0.0)]
 
 
-def test_whole_seconds_are_told() -> None:
+def test_times_in_whole_seconds_are_reported() -> None:
     """As a spreadsheet leaves Unix seconds."""
     assert not [*check_fractions(FRAMES_S)]
     assert not [*check_fractions(np.floor(FRAMES_S[:4]))]
@@ -61,7 +61,7 @@ def test_the_shift_that_fits_is_named(ahead_s: float, words: str) -> None:
     assert doubt.figures["shift_s"] == pytest.approx(-ahead_s)
 
 
-def test_frames_of_another_drive_are_told() -> None:
+def test_frames_of_another_drive_are_reported() -> None:
     (doubt,) = check_overlap(FRAMES_S + 500.0, TRAJECTORY_S, 0.0)
     assert (doubt.code, doubt.is_grave) == (Cause.NO_OVERLAP, True)
     assert "24 of 24 frames" in doubt.sentence
@@ -77,19 +77,19 @@ def test_frames_of_another_drive_are_told() -> None:
         (3600.0, "local time"),
     ],
 )
-def test_exif_tells_another_clock(ahead_s: float, words: str) -> None:
+def test_a_clock_that_contradicts_exif_is_reported(ahead_s: float, words: str) -> None:
     exif = np.floor(FRAMES_S)
     (doubt,) = check_exif_times([*(FRAMES_S + ahead_s)], [*exif])
     assert (doubt.code, doubt.is_grave) == (Cause.CLOCK, False)
     assert words in doubt.sentence
 
 
-def test_clocks_of_cameras_are_off_and_that_is_no_doubt() -> None:
+def test_a_constant_offset_of_the_camera_clock_raises_no_doubt() -> None:
     for ahead_s in (0.0, 0.4, 5.0, -61.0, 1000.0):
         assert not [*check_exif_times([*(FRAMES_S + ahead_s)], [*FRAMES_S])]
 
 
-def test_times_of_other_frames_are_told() -> None:
+def test_times_assigned_to_other_frames_are_reported() -> None:
     (doubt,) = check_exif_times([*FRAMES_S[::-1]], [*FRAMES_S])
     assert doubt.code is Cause.FRAME_ORDER
 

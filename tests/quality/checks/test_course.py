@@ -55,7 +55,7 @@ def test_headings_along_the_course_raise_no_doubt() -> None:
         (lambda h: 47.0 + 2.0 * h, Cause.HEADING, "no other convention fits"),
     ],
 )
-def test_the_reading_that_fits_is_named(
+def test_the_heading_convention_that_fits_is_named(
     turned: Callable[[FloatArray], FloatArray], code: Cause, words: str
 ) -> None:
     (doubt,) = check_attitude(drive(turned))
@@ -64,7 +64,7 @@ def test_the_reading_that_fits_is_named(
     assert words in doubt.sentence.partition(", or ")[0]
 
 
-def test_in_a_straight_line_all_readings_that_fit_are_named() -> None:
+def test_on_a_straight_line_all_fitting_heading_conventions_are_named() -> None:
     course = np.full(100, 90.0)
     attitude = np.column_stack((np.zeros((100, 2)), np.full(100, 270.0)))
     (doubt,) = check_attitude(Course(course, attitude))
@@ -72,7 +72,7 @@ def test_in_a_straight_line_all_readings_that_fit_are_named() -> None:
     assert "anticlockwise from" in doubt.sentence
 
 
-def test_axes_that_point_up_are_told() -> None:
+def test_axes_that_point_up_are_reported() -> None:
     (doubt,) = check_attitude(drive(roll=179.5))
     assert doubt.code is Cause.ATTITUDE
     assert "its z axis points up" in doubt.sentence
@@ -87,7 +87,7 @@ def test_a_vehicle_that_stands_has_no_course() -> None:
     assert not [*check_attitude(None)]
 
 
-def test_lever_arms_in_words_and_beyond_belief() -> None:
+def test_lever_arms_are_described_and_implausible_ones_are_doubted() -> None:
     arm = VehicleSettings(lever_arm_m=(-0.8, 0.15, -1.95))
     assert lever_arm_text(arm) == "0.80 m behind, 0.15 m to the right, 1.95 m above"
     assert not [*check_lever_arm(arm, ["A"])]

@@ -33,7 +33,7 @@ def test_frames_of_another_size_are_counted(size: tuple[int, int], words: str) -
     assert words in doubt.remedy
 
 
-def test_a_stray_frame_is_no_grave_doubt() -> None:
+def test_a_single_frame_of_another_size_raises_no_grave_doubt() -> None:
     (doubt,) = check_frames([*DJI, FrameHeader("logo.png", (64, 64))], CAMERA)
     assert not doubt.is_grave
     assert "logo.png is 64 x 64 px" in doubt.sentence
@@ -58,7 +58,9 @@ def test_two_cameras_and_two_zooms_are_named() -> None:
         (1.5, Cause.FOCAL_LENGTH, "this camera and zoom"),
     ],
 )
-def test_exif_tells_another_focal_length(factor: float, code: Cause, words: str) -> None:
+def test_a_focal_length_that_contradicts_exif_is_reported(
+    factor: float, code: Cause, words: str
+) -> None:
     wrong = replace(CAMERA, fx=factor * CAMERA.fx, fy=factor * CAMERA.fy)
     (doubt,) = check_frames(DJI, wrong)
     assert doubt.code is code
@@ -67,5 +69,5 @@ def test_exif_tells_another_focal_length(factor: float, code: Cause, words: str)
 
 
 @pytest.mark.parametrize("focal_35_mm", [24.0, 29.0])
-def test_equivalents_are_rough(focal_35_mm: float) -> None:
+def test_focal_lengths_in_35_mm_equivalents_have_a_tolerance(focal_35_mm: float) -> None:
     assert not [*check_frames([replace(DJI[0], focal_35_mm=focal_35_mm)], CAMERA)]

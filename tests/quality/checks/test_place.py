@@ -55,7 +55,7 @@ def test_exchanged_axes_are_named(crs: str, x: float, y: float) -> None:
         ("EPSG:27700", 689586.0, 5336252.0, Cause.CRS, "outside the area of EPSG:27700"),
     ],
 )
-def test_what_coordinates_seem_to_be_is_named(
+def test_the_probable_reading_of_coordinates_is_named(
     crs: str, x: float, y: float, code: Cause, words: str
 ) -> None:
     (doubt,) = check_place(crs, np.array([[x, y, 500.0]]), "the trajectory")
@@ -63,13 +63,13 @@ def test_what_coordinates_seem_to_be_is_named(
     assert words in doubt.sentence
 
 
-def test_a_place_in_words() -> None:
+def test_a_place_is_described_in_words() -> None:
     assert place_text("EPSG:32719", -70.6, -33.4).startswith(
         "33.4000° S 70.6000° W; EPSG:32719 is for: Between 72°W and 66°W, southern hemisphere"
     )
 
 
-def test_areas_beyond_the_antimeridian() -> None:
+def test_areas_of_use_may_cross_the_antimeridian() -> None:
     area = area_of_use("EPSG:3832")  # PDC Mercator, the Pacific
     assert area is not None
     assert area.west_deg > area.east_deg
@@ -77,7 +77,7 @@ def test_areas_beyond_the_antimeridian() -> None:
     assert area.degrees_outside(0.0, 0.0) > 60.0
 
 
-def test_points_that_no_map_has_are_not_numbers() -> None:
+def test_points_outside_the_map_are_nan() -> None:
     place = longitude_latitude("EPSG:25832", np.array([[689586.0, 5336252.0], [1e30, 1e30]]))
     assert place[0] == pytest.approx([11.549, 48.151], abs=1e-3)
     assert np.isnan(place[1]).all()
@@ -110,7 +110,7 @@ def test_a_flight_across_the_antimeridian_raises_no_doubt() -> None:
         (GROUND[:, ::-1], Cause.AXES_SWAPPED, "with longitude and latitude exchanged it fits"),
     ],
 )
-def test_a_trajectory_far_from_the_frames_gps(
+def test_a_trajectory_far_from_the_frames_gps_is_reported(
     ground: np.ndarray[tuple[int, ...], np.dtype[np.float64]], code: Cause, words: str
 ) -> None:
     (doubt,) = check_camera_position(
@@ -124,7 +124,7 @@ def test_a_trajectory_far_from_the_frames_gps(
     ("ratio", "code"),
     [(0.5, Cause.DIAMETERS), (2.05, Cause.DIAMETERS), (30.0, Cause.DISTANCE_SCALE)],
 )
-def test_altitudes_tell_radii(ratio: float, code: Cause) -> None:
+def test_distances_that_contradict_the_altitude_are_reported(ratio: float, code: Cause) -> None:
     altitude = np.array([40.0, 60.0, 80.0, 95.0])
     (doubt,) = check_altitude(altitude, ratio * altitude)
     assert doubt.code is code

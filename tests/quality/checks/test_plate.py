@@ -32,7 +32,7 @@ def target(outer_m: float = 0.9, inner_ratio: float = 0.5, white_share: float = 
         (0.5, 0.35, "the dots of 'A' cover 35% of the ring; many such rings are not found"),
     ],
 )
-def test_layouts_that_are_hard_to_find_are_told(
+def test_layouts_that_are_hard_to_find_are_reported(
     inner_ratio: float, white_share: float, words: str
 ) -> None:
     doubts = [*check_plates([target(inner_ratio=inner_ratio, white_share=white_share)])]
@@ -50,7 +50,7 @@ def test_layouts_that_are_hard_to_find_are_told(
         (90.0, "90 m (2.29 m if it is in inches, 0.9 m if it is in centimetres)"),
     ],
 )
-def test_diameters_in_other_units_are_told(outer_m: float, words: str) -> None:
+def test_diameters_in_other_units_are_reported(outer_m: float, words: str) -> None:
     doubts = [*check_plates([target(outer_m)])]
     assert [doubt.code for doubt in doubts] == [Cause.DIAMETERS] * bool(words)
     assert all(words in doubt.sentence and doubt.is_grave for doubt in doubts)

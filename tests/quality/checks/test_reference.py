@@ -59,7 +59,7 @@ def test_cameras_above_the_vehicle_raise_no_doubt() -> None:
         (PLACE - np.array([0.0, 0.0, 100.0]), PLACE, Cause.HEIGHTS, "40.0 m below the vehicle"),
     ],
 )
-def test_cameras_elsewhere_are_told(
+def test_cameras_far_from_the_vehicle_are_reported(
     camera: FloatArray, ground: FloatArray, code: Cause, words: str
 ) -> None:
     place = camera if camera[2] > 400.0 else np.array([*camera[:2], 545.0])
@@ -70,7 +70,7 @@ def test_cameras_elsewhere_are_told(
     assert words in doubt.sentence
 
 
-def test_poses_of_other_frames_or_that_see_nothing_are_told() -> None:
+def test_poses_of_other_frames_or_that_see_no_target_are_reported() -> None:
     names = poses(PLACE).frames
     assert not [*check_visibility(names, names, np.array([20.0]))]
     assert not [*check_visibility(names, names, None)]

@@ -58,7 +58,7 @@ def test_a_correct_flight_fits_and_needs_no_cause(encounters: Encounters) -> Non
     assert not [*check_lone_frames(encounters)]
 
 
-def test_cubics_between_samples_are_those_of_the_motion(encounters: Encounters) -> None:
+def test_interpolated_cubics_equal_the_motion(encounters: Encounters) -> None:
     times = encounters.time_s + 0.0123
     states = encounters.vehicle.motion.states(times)
     moved = encounters.at(times)
@@ -66,7 +66,7 @@ def test_cubics_between_samples_are_those_of_the_motion(encounters: Encounters) 
     assert np.abs(moved.frame_from_body - states.frame_from_body).max() < 1e-4
 
 
-def test_times_outside_the_trajectory_have_no_place(encounters: Encounters) -> None:
+def test_times_outside_the_trajectory_have_no_position(encounters: Encounters) -> None:
     early = encounters.at(encounters.time_s - 20.0)
     outside = early.time_s < encounters.vehicle.motion.time_s[0]
     assert 0 < np.count_nonzero(outside) < len(outside)
@@ -90,7 +90,7 @@ def test_the_misfit_is_one_where_variances_are_right() -> None:
         changed(CAMERA, cx=620.0, cy=430.0),
     ],
 )
-def test_another_camera_measures_what_it_would_have_measured(
+def test_converting_to_another_camera_equals_measuring_with_it(
     encounters: Encounters, camera: dict[str, float], tmp_path: Path
 ) -> None:
     """Measured with a wrong camera and again with the right one: as if it had never been wrong."""
@@ -103,7 +103,7 @@ def test_another_camera_measures_what_it_would_have_measured(
     assert off.max() < 3e-3
 
 
-def test_every_slip_moves_something_and_says_what_to_do(encounters: Encounters) -> None:
+def test_every_slip_changes_the_misfit_and_has_a_remedy(encounters: Encounters) -> None:
     named = [*slips(encounters)]
     assert len({slip.words for slip in named}) == len(named) > 30
     for slip in named:
@@ -136,7 +136,7 @@ def moved(encounters: Encounters, shift: FloatArray) -> Encounters:
         (lambda _: np.array([0.8, -0.6, 0.0]), "constant on the ground, by 0.99 m"),
     ],
 )
-def test_the_pattern_of_a_disagreement_is_told(
+def test_the_pattern_of_a_disagreement_is_reported(
     encounters: Encounters, shift: object, words: str
 ) -> None:
     assert callable(shift)
@@ -146,7 +146,9 @@ def test_the_pattern_of_a_disagreement_is_told(
     assert any(name.startswith(words) for name in names), found
 
 
-def test_what_has_no_pattern_is_said_so(encounters: Encounters) -> None:
+def test_a_disagreement_without_a_pattern_is_reported_as_unexplained(
+    encounters: Encounters,
+) -> None:
     noise = np.random.default_rng(5).standard_normal(encounters.centre_m.shape)
     doubt = unexplained(moved(encounters, noise))
     assert "no single cause explains this" in doubt.sentence
@@ -158,7 +160,7 @@ def along(encounters: Encounters, motion: Motion) -> Encounters:
     return replace(encounters, vehicle=vehicle).at(encounters.time_s)
 
 
-def test_few_frames_inside_a_trajectory_tell_no_cause(encounters: Encounters) -> None:
+def test_few_frames_inside_a_trajectory_give_no_cause(encounters: Encounters) -> None:
     motion = encounters.vehicle.motion
     rows = motion.time_s < np.quantile(encounters.time_s, 0.45)
     short = replace(
@@ -182,7 +184,7 @@ def test_a_clock_that_moves_most_frames_outside_is_still_named(encounters: Encou
     assert np.isfinite([*doubt.figures.values()]).all()
 
 
-def test_a_lone_frame_is_counted(encounters: Encounters) -> None:
+def test_a_single_contradicting_frame_is_reported(encounters: Encounters) -> None:
     shift = np.zeros_like(encounters.centre_m)
     shift[4, 0] = 3.0
     (doubt,) = check_lone_frames(moved(encounters, shift))
@@ -190,7 +192,9 @@ def test_a_lone_frame_is_counted(encounters: Encounters) -> None:
     assert "up to 3.0 m apart" in doubt.sentence
 
 
-def test_a_lone_frame_while_gnss_is_out_is_as_good_as_its_deviations_say(tmp_path: Path) -> None:
+def test_a_single_frame_during_a_gnss_outage_within_its_deviations_is_accepted(
+    tmp_path: Path,
+) -> None:
     flight_inputs = inputs_of(tmp_path / "flight", CAMERA)
     sightings, positions, poses, camera = flight_inputs
     vehicle = positions.vehicle
@@ -210,7 +214,7 @@ def test_a_lone_frame_while_gnss_is_out_is_as_good_as_its_deviations_say(tmp_pat
     assert not [*check_lone_frames(moved(found, shift))]
 
 
-def test_a_mount_between_right_angles_is_named_as_seen(encounters: Encounters) -> None:
+def test_a_mount_between_right_angles_is_reported_as_estimated(encounters: Encounters) -> None:
     settings = replace(encounters.vehicle.settings, mount_deg=33.0)
     (doubt,) = check_mount(
         replace(encounters, vehicle=replace(encounters.vehicle, settings=settings))

@@ -38,7 +38,7 @@ def test_one_epoch_that_jumps_is_named(rate_hz: float, jump_m: float, sd_m: floa
     assert doubt.figures["epochs"] == 1.0
 
 
-def test_all_such_epochs_are_counted() -> None:
+def test_all_epochs_that_jump_are_counted() -> None:
     time_s = np.arange(0.0, 60.0, 0.1)
     position_m = driven(time_s)
     position_m[[100, 300, 400], 0] += [5.0, -30.0, 8.0]
@@ -92,7 +92,7 @@ def test_single_epochs_and_runs_are_counted_together() -> None:
     assert doubt.figures["epochs"] == 9.0
 
 
-def test_roads_raise_no_doubt() -> None:
+def test_paths_of_normal_drives_raise_no_doubt() -> None:
     for rate_hz in (1.0, 2.0, 5.0, 20.0, 100.0):
         time_s = np.arange(0.0, 60.0, 1.0 / rate_hz)
         assert not [*check_spikes(motion(time_s, driven(time_s)))]

@@ -83,7 +83,7 @@ def test_clipping_moves_the_one_edge_of_the_paper(flight: Flight) -> None:
     assert brighter.change_percent > 0.3  # the ring shrinks: it seems farther away
 
 
-def test_what_is_not_found_unchanged_is_left_out(flight: Flight) -> None:
+def test_frames_whose_target_is_not_found_unchanged_are_left_out(flight: Flight) -> None:
     grey, seen, radius_px = seen_in(flight, "frame_0005.jpg")
     blank = np.full_like(grey, 120)
     target, settings = flight.targets[0], DetectSettings()

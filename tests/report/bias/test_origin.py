@@ -65,7 +65,7 @@ def test_the_headline_identifies_the_flight(flight: Flight) -> None:
     assert line.endswith("target A, 0.9 m · EPSG:25832")
 
 
-def test_what_is_not_known_is_left_out(flight: Flight) -> None:
+def test_unknown_parts_are_left_out(flight: Flight) -> None:
     timeless = Outcomes(24, 24, 21, (), None, None)
     labels = [fact.label for fact in facts(flight, DetectSettings(), timeless, {})]
     assert "Time of the frames" not in labels

@@ -171,14 +171,14 @@ def test_figures_fit_the_window(page: Page) -> None:
         assert plot.evaluate("(e) => e.parentElement.scrollWidth <= e.parentElement.clientWidth")
 
 
-def test_tables_that_go_on_show_it(page: Page) -> None:
+def test_wide_tables_scroll_and_show_that_they_continue(page: Page) -> None:
     """A table wider than the window scrolls by itself, with a shadow where it goes on."""
     for box in page.query_selector_all(".wide:has(table)"):
         assert box.evaluate("(e) => getComputedStyle(e).overflowX") == "auto"
         assert "local" in box.evaluate("(e) => getComputedStyle(e).backgroundAttachment")
 
 
-def test_the_first_printed_page_is_full(page: Page) -> None:
+def test_the_first_printed_page_is_well_filled(page: Page) -> None:
     """On A4, verdict, agreement and origin take more than half of it; a figure takes the next."""
     page.emulate_media(media="print")
     page.set_viewport_size({"width": 688, "height": 1009})  # 182 mm by 267 mm
@@ -222,7 +222,7 @@ def test_the_keyboard_reaches_every_point(page: Page) -> None:
     assert not page.locator("dialog").is_visible()
 
 
-def test_a_frame_without_close_up_says_so_whatever_it_is_called(page: Page) -> None:
+def test_a_frame_without_close_up_is_reported_under_any_name(page: Page) -> None:
     plot = page.locator(".plot[data-picture=time]")
     plot.focus()
     for _ in range(4):

@@ -102,13 +102,13 @@ def test_focal_length_and_lever_arm_are_named(fly: Fly) -> None:
     assert "too short" in by_offset
 
 
-def test_what_is_significant_but_small_does_not_spoil_a_flight(fly: Fly) -> None:
+def test_significant_but_small_errors_keep_the_grade_good(fly: Fly) -> None:
     numbers = fly(lambda d: np.full_like(d, 0.004), sd_m=0.0001, noise_m=0.001)
     assert "lever arm" in texts(numbers, FlightGrade.GOOD)
     assert assess(numbers).grade is FlightGrade.GOOD
 
 
-def test_what_the_reference_can_cause_is_no_finding(fly: Fly) -> None:
+def test_errors_that_the_reference_can_cause_are_no_finding(fly: Fly) -> None:
     """An offset of 20 mm, far beyond the noise of 1 mm, by a reference that is known to 20 mm."""
     numbers = fly(lambda d: np.full_like(d, 0.02), sd_m=0.02, noise_m=0.001)
     assert numbers.regression is not None
@@ -169,7 +169,9 @@ def test_a_constant_offset_is_called_a_bias_and_noise_is_not(
     assert "No bias beyond noise" in texts(plain)
 
 
-def test_what_the_reference_may_be_off_is_no_bias(compare: Compare, study: Study) -> None:
+def test_a_mean_error_that_the_reference_can_cause_is_no_bias(
+    compare: Compare, study: Study
+) -> None:
     rng = np.random.default_rng(8)
     errors = rng.normal(0.12, 0.05, 40)  # known to 0.02 m: 0.1 % at 20 m, for all frames alike
     numbers = bias_numbers(study(*map(compare, np.linspace(18.0, 22.0, 40), errors)))
@@ -178,7 +180,7 @@ def test_what_the_reference_may_be_off_is_no_bias(compare: Compare, study: Study
     assert "errors of the reference" in texts(numbers)
 
 
-def test_a_bias_of_the_far_half_alone_is_found(compare: Compare, study: Study) -> None:
+def test_a_bias_in_the_far_half_only_is_found(compare: Compare, study: Study) -> None:
     rng = np.random.default_rng(6)
     near = zip(np.linspace(10, 49, 40), rng.normal(0.0, 0.3, 40), strict=True)
     far = zip(np.linspace(51, 100, 12), rng.normal(0.15, 0.05, 12), strict=True)
@@ -207,13 +209,13 @@ def test_rounding_is_not_an_exposure_that_varies(compare: Compare, study: Study)
     assert bias_numbers(study(*compared)).influences == ()
 
 
-def test_reservations_are_spoken(compare: Compare, study: Study) -> None:
+def test_reservations_against_the_numbers_are_stated(compare: Compare, study: Study) -> None:
     numbers = bias_numbers(study(compare(30.0, 0.1), attitudes_agree=False))
     assert "check omega, phi, kappa" in texts(numbers, FlightGrade.LOOK)
     assert "One frame is not enough to determine a bias." in texts(numbers)
 
 
-def test_amounts_are_rounded_by_their_deviation() -> None:
+def test_amounts_are_rounded_according_to_their_deviation() -> None:
     assert signed_amount(0.0010234, 0.000123, "%", 100.0) == "+0.102 ± 0.012 %"
     assert signed_amount(-12.34, 5.6, "mm") == "−12.3 ± 5.6 mm"
     assert signed_amount(-0.001, 56.0, "mm") == "0 ± 56 mm"
@@ -242,7 +244,7 @@ def test_measurement_and_reference_are_stated_side_by_side(fly: Fly) -> None:
     assert "Reference distances are known to 20 mm, measured ones to 1 mm" in texts(fly())
 
 
-def test_what_the_reference_can_cause_stands_beside_each_bias(fly: Fly) -> None:
+def test_each_bias_is_stated_with_the_error_the_reference_can_cause(fly: Fly) -> None:
     biased = texts(fly(lambda distance: 0.005 * distance))
     assert re.search(r"by \+0\.\d+ ± 0\.\d+ % \(the reference can cause ± 0\.\d+ %\)", biased)
     assert re.search(r"same percentage\. Errors of the reference can cause ± 0\.\d+ %\.", biased)

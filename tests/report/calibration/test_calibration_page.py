@@ -66,7 +66,7 @@ def calibration() -> CameraCalibration:
     return calibrate_camera(views, field, (CAMERA.width, CAMERA.height), settings)
 
 
-def test_eccentricities_are_those_of_discs_with_normals_of_their_own(
+def test_eccentricities_use_the_individual_normals_of_discs(
     calibration: CameraCalibration,
 ) -> None:
     estimate = calibration.solution.estimate
@@ -92,7 +92,9 @@ def test_heights_are_drawn_towards_the_camera_on_either_side(
     assert side_of_cameras(turned) == -1.0
 
 
-def test_a_good_fit_is_told_with_what_it_does_not_determine(calibration: CameraCalibration) -> None:
+def test_a_good_fit_is_reported_with_what_it_does_not_determine(
+    calibration: CameraCalibration,
+) -> None:
     told = fit_words(calibration)
     assert re.fullmatch(
         r"The RMS of the residuals is 0\.01\d px, the standard deviation of a measured disc"
@@ -117,7 +119,7 @@ def test_a_good_fit_is_told_with_what_it_does_not_determine(calibration: CameraC
         ),
     ],
 )
-def test_what_gives_the_field_its_scale_is_told(
+def test_the_source_of_the_field_s_scale_is_reported(
     calibration: CameraCalibration, points: PointModel, *, has_bar: bool, told: str
 ) -> None:
     bars = (FieldBar("p-30", "p-31", 0.05, 0.00001),) if has_bar else ()

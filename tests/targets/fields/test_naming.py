@@ -77,7 +77,7 @@ def test_every_disc_gets_its_own_name(
 
 @pytest.mark.parametrize("field", [PLAIN, HEXAGONAL], ids=lambda f: f.name)
 @pytest.mark.parametrize("turn_deg", [0.0, 77.0, 130.0, 181.0, 265.0])
-def test_a_symmetric_field_is_told_as_such_and_taken_upright(field: Field, turn_deg: float) -> None:
+def test_a_symmetric_field_is_reported_and_named_upright(field: Field, turn_deg: float) -> None:
     found, truth = seen(field, turn_deg, (0.5, -0.3), (0.0, 0.0))
     naming = name_discs(found, field)
     assert isinstance(naming, Naming)
@@ -107,7 +107,7 @@ def test_part_of_a_field_without_its_mark_is_not_guessed() -> None:
 
 
 @pytest.mark.parametrize(("radius_px", "is_told"), [(2.0, False), (2.7, True), (5.0, True)])
-def test_a_hole_too_small_to_be_seen_does_not_speak_against_its_place(
+def test_a_hole_too_small_to_be_seen_does_not_exclude_a_naming(
     radius_px: float,
     is_told: bool,  # noqa: FBT001 - a parameter of the test
 ) -> None:
@@ -130,7 +130,7 @@ def test_a_hole_too_small_to_be_seen_does_not_speak_against_its_place(
 
 
 @pytest.mark.parametrize(("diameter_m", "is_mark"), [(0.0128, True), (0.0124, False)])
-def test_a_disc_marks_a_field_if_its_size_can_be_told(
+def test_a_disc_is_a_mark_only_if_its_size_is_clearly_different(
     diameter_m: float,
     is_mark: bool,  # noqa: FBT001 - a parameter of the test
 ) -> None:
@@ -160,7 +160,7 @@ def test_a_mark_whose_hole_is_not_seen_does_not_count_as_one() -> None:
         assert naming.marks == marks
 
 
-def test_what_is_no_field_is_said() -> None:
+def test_the_reason_is_given_if_discs_are_no_field() -> None:
     found, _ = seen(SQUARE, 0.0, (0.0, 0.0), (0.0, 0.0))
     few = SeenDiscs(found.centres[:4], found.stretches[:4], found.is_hollow[:4])
     assert name_discs(few, SQUARE) is NamingProblem.TOO_FEW
@@ -176,7 +176,7 @@ def test_what_is_no_field_is_said() -> None:
     assert name_discs(both, SMALL) is NamingProblem.TWO_FIELDS
 
 
-def test_lattices_count_as_their_programs_do() -> None:
+def test_lattices_are_numbered_as_in_their_programs() -> None:
     asymmetric = ASYMMETRIC.points_m()
     expected = [((2 * i + j % 2) * 0.016, j * 0.016) for j in range(11) for i in range(4)]
     assert np.allclose(asymmetric[:, :2], expected)
@@ -210,7 +210,7 @@ def test_a_distance_may_be_measured_twice() -> None:
         ({"bars": (bar("r0c0", "r0c8", 0.202), bar("r0c8", "r0c0", 0.198))}, "length_m"),
     ],
 )
-def test_what_cannot_be_a_field_is_refused(change: dict[str, object], key: str) -> None:
+def test_impossible_fields_are_refused(change: dict[str, object], key: str) -> None:
     values: dict[str, object] = {"columns": 9, "rows": 6, "pitch_m": 0.025, "diameter_m": 0.012}
     with pytest.raises(SettingError) as caught:
         Field("f", GridKind.SQUARE, **(values | change))  # type: ignore[arg-type]  # wrong on purpose

@@ -93,14 +93,14 @@ def test_a_grid_has_no_names() -> None:
     assert name_by_places(seen(field, 20.0, (0.3, 0.1)), field) is NamingProblem.AMBIGUOUS
 
 
-def test_another_field_is_none() -> None:
+def test_discs_of_another_field_are_not_named() -> None:
     rng = np.random.default_rng(5)
     centres = rng.uniform([300, 300], [1300, 900], (30, 2))
     other = SeenDiscs(centres, np.tile(12.0 * np.eye(2), (30, 1, 1)), np.zeros(30, dtype=bool))
     assert name_by_places(other, scattered()) is NamingProblem.NO_LATTICE
 
 
-def test_codes_name_whatever_turn_they_are_read_from() -> None:
+def test_codes_are_recognised_from_any_starting_sector() -> None:
     codes = (0b00000001, 0b00000011, 0b00000101, 0b00000111, 0b00001011, 0b00010101, 0b00011011)
     points = [
         FieldPoint(f"p{i}", (0.05 * i, 0.04 * (i % 3), 0.0), 0.01, code=code)

@@ -29,7 +29,7 @@ def coded(*codes: int | None) -> tuple[FieldPoint, ...]:
     )
 
 
-def test_a_field_knows_its_discs() -> None:
+def test_a_field_gives_the_properties_of_its_discs() -> None:
     own = replace(POINTS[2], sd_m=(1e-6, 2e-6, 3e-6))
     field = PointField("f", (*POINTS[:2], own, *POINTS[3:]), flat_sd_m=(1e-4, 1e-4, 2e-4))
     assert field.names() == ("p0", "p1", "p2", "p3", "p4", "p5")
@@ -39,13 +39,13 @@ def test_a_field_knows_its_discs() -> None:
     assert gaps_between(field.points_m())[0, :2] == pytest.approx([np.inf, np.hypot(0.05, 0.01)])
 
 
-def test_codes_are_the_least_of_their_turns() -> None:
+def test_codes_are_stored_as_the_smallest_of_their_rotations() -> None:
     assert RING.canonical(0b1100000000) == 0b11
     assert RING.canonical(0b1000000101) == 0b1011
     assert PointField("f", coded(0b1100000000, 5, 7, 9, 11, 13), code=RING).named_by == "code"
 
 
-def test_codes_may_come_closer_across_an_edge() -> None:
+def test_code_rings_may_be_closer_on_different_faces() -> None:
     points = coded(3, 5, 7, 9, 11, 13)
     upright = tuple(replace(point, normal=(0.0, 1.0, 0.0)) for point in points[:3])
     ring = CodeRing(10, 2.0, 5.0)
@@ -96,13 +96,13 @@ def test_codes_may_come_closer_across_an_edge() -> None:
         ({"flat_sd_m": (0.0, 1e-4, 1e-4)}, "flat_sd_m"),
     ],
 )
-def test_what_is_no_field(values: dict[str, Any], message: str) -> None:
+def test_impossible_fields_are_refused(values: dict[str, Any], message: str) -> None:
     with pytest.raises(SettingError, match=message):
         PointField(**{"name": "f", "points": POINTS, **values})
 
 
 @pytest.mark.parametrize("ring", [(5, 2.0, 3.0), (10, 1.1, 3.0), (10, 2.0, 2.1), (10, 2.0, 11.0)])
-def test_what_is_no_ring_of_codes(ring: tuple[int, float, float]) -> None:
+def test_impossible_code_rings_are_refused(ring: tuple[int, float, float]) -> None:
     bits, inner, outer = ring
     with pytest.raises(SettingError):
         CodeRing(bits, inner, outer)

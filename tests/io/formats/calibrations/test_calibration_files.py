@@ -65,7 +65,7 @@ def test_every_format_has_a_sample() -> None:
 
 
 @pytest.mark.parametrize("form", sorted(FORMATS.names))
-def test_the_content_tells_the_format_whatever_the_name(tmp_path: Path, form: str) -> None:
+def test_the_format_is_recognised_by_content_and_not_by_name(tmp_path: Path, form: str) -> None:
     path = write(tmp_path, "camera", SAMPLES[form])
     named = read_calibration(path, (WIDTH, HEIGHT), form)
     assert read_calibration(path, (WIDTH, HEIGHT)) == named
@@ -73,7 +73,7 @@ def test_the_content_tells_the_format_whatever_the_name(tmp_path: Path, form: st
 
 @pytest.mark.parametrize("form", sorted(FORMATS.names))
 @pytest.mark.parametrize("content", ["", "no such thing\n", "[1, 2]", "{}", "<a/>", "\x00\x01"])
-def test_a_format_that_is_named_wrongly_is_a_line_about_the_file(
+def test_a_wrong_format_name_is_a_one_line_error_about_the_file(
     tmp_path: Path, form: str, content: str
 ) -> None:
     path = write(tmp_path, "camera", content)
@@ -90,7 +90,7 @@ def test_a_format_that_is_named_wrongly_is_a_line_about_the_file(
     k1=st.floats(-0.3, 0.3),
     p1=st.floats(-0.01, 0.01),
 )
-def test_colmap_round_trip(
+def test_a_colmap_camera_is_read_back_as_it_was_written(
     tmp_path_factory: pytest.TempPathFactory, cx: float, cy: float, k1: float, p1: float
 ) -> None:
     folder = tmp_path_factory.mktemp("colmap")

@@ -121,7 +121,7 @@ def test_opensfm_cameras_are_normalised_by_the_longer_side(
     check(camera, expected)
 
 
-def test_opensfm_s_perspective_camera_looks_through_the_middle(
+def test_opensfm_s_perspective_camera_has_its_principal_point_in_the_middle(
     tmp_path: Path, brown: Brown
 ) -> None:
     values = {"projection_type": "perspective", "focal": 0.94, "k1": K1, "k2": K2}
@@ -162,7 +162,7 @@ def test_a_published_opensfm_camera_of_resized_frames_holds_for_the_originals(
         read_calibration(path, (3648, 5472))
 
 
-def test_a_reconstruction_is_a_file_of_cameras(tmp_path: Path) -> None:
+def test_cameras_can_be_read_from_a_reconstruction(tmp_path: Path) -> None:
     parts = [{"cameras": {"a": BROWN}, "shots": {}}, {"cameras": {"b": BROWN}, "shots": {}}]
     path = write(tmp_path, "reconstruction.json", parts)
     single = write(tmp_path, "cameras.json", {"b": BROWN})

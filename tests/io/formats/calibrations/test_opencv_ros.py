@@ -57,7 +57,7 @@ def opencv_file(
 @pytest.mark.parametrize(
     "coefficients", [PLUMB_BOB[:4], PLUMB_BOB, RATIONAL, [*RATIONAL, *[0.0] * 4]]
 )
-def test_opencv_s_files_mean_what_opencv_projects(
+def test_opencv_files_project_as_opencv_does(
     tmp_path: Path, suffix: str, coefficients: list[float]
 ) -> None:
     path = opencv_file(tmp_path / f"camera.{suffix}", coefficients)
@@ -79,7 +79,9 @@ def test_opencv_s_files_mean_what_opencv_projects(
         ("camera_matrix", "dist_coefs"),
     ],
 )
-def test_the_names_of_opencv_s_samples_are_known(tmp_path: Path, keys: tuple[str, str]) -> None:
+def test_the_key_names_of_opencv_s_samples_are_accepted(
+    tmp_path: Path, keys: tuple[str, str]
+) -> None:
     path = opencv_file(
         tmp_path / "camera.yml", PLUMB_BOB, ("image_Width", "image_Height"), keys=keys
     )
@@ -87,7 +89,7 @@ def test_the_names_of_opencv_s_samples_are_known(tmp_path: Path, keys: tuple[str
     assert (camera.fx, camera.k3, camera.height) == (2300.5, 0.011, 1200)
 
 
-def test_the_header_of_older_opencv_is_known(tmp_path: Path) -> None:
+def test_the_header_of_older_opencv_files_is_accepted(tmp_path: Path) -> None:
     path = opencv_file(tmp_path / "camera.yml", PLUMB_BOB)
     path.write_text(path.read_text().replace("%YAML 1.2", "%YAML:1.0"))
     assert read_calibration(path, SILENT).cy == 594.75
@@ -100,7 +102,7 @@ def test_ros_camera_info_is_the_same_camera(tmp_path: Path) -> None:
     assert read_calibration(path, SILENT) == read_calibration(opencv, SILENT)
 
 
-def test_the_size_may_stand_beside_a_silent_file_and_must_agree(tmp_path: Path) -> None:
+def test_the_image_size_may_be_stated_in_flight_toml_and_must_agree(tmp_path: Path) -> None:
     silent = opencv_file(tmp_path / "silent.yml", PLUMB_BOB, None)
     assert read_calibration(silent, (1601, 1201)).width == 1601
     with pytest.raises(KgcpError, match=r"silent.yml: has no image size; add width and height"):
@@ -111,7 +113,7 @@ def test_the_size_may_stand_beside_a_silent_file_and_must_agree(tmp_path: Path) 
         read_calibration(sized, (None, 900))
 
 
-def test_distortion_of_an_unknown_name_is_not_taken_for_none(tmp_path: Path) -> None:
+def test_an_unknown_distortion_model_is_refused(tmp_path: Path) -> None:
     path = opencv_file(tmp_path / "camera.yml", PLUMB_BOB, keys=("camera_matrix", "kc"))
     with pytest.raises(KgcpError, match="has no distortion_coefficients; give them this name"):
         read_calibration(path, SILENT)

@@ -118,7 +118,7 @@ def test_pix4d_blocks_of_equal_parameters_are_one_camera(
     assert read_calibration(path, SILENT, camera="c.JPG").fy == 1706.0
 
 
-def test_a_published_pix4d_calibration(tmp_path: Path) -> None:
+def test_a_published_pix4d_calibration_is_read(tmp_path: Path) -> None:
     # The sample project of DSC_0157.JPG: an image of 7360 x 4912 px.
     block = """\
 DSC_0157.JPG 7360 4912

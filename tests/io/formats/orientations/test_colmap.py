@@ -40,7 +40,7 @@ def colmap_folder(folder: Path, rotation: FloatArray, shift: FloatArray) -> Path
     return folder / "images.txt"
 
 
-def test_colmap_s_own_files_in_map_coordinates(
+def test_files_written_by_colmap_are_read_in_map_coordinates(
     tmp_path: Path, truth: Truth, check: Check, world_to_camera: Invert
 ) -> None:
     rotation, shift = world_to_camera(truth["utm"] - OFFSET, truth["utm_from_photo"])
@@ -55,7 +55,7 @@ def test_colmap_s_own_files_in_map_coordinates(
     check(poses, truth["utm"], truth["utm_from_photo"])
 
 
-def test_colmap_in_geocentric_coordinates(
+def test_colmap_models_may_be_geocentric(
     tmp_path: Path, truth: Truth, check: Check, world_to_camera: Invert
 ) -> None:
     rotation, shift = world_to_camera(truth["ecef"], truth["ecef_from_photo"])
@@ -83,7 +83,7 @@ def test_the_quaternion_has_w_first_and_the_points_line_may_be_empty(tmp_path: P
     np.testing.assert_allclose(rotation_from_opk(poses.opk_deg)[0], expected, atol=1e-12)
 
 
-def test_images_of_a_rig_have_poses_of_their_own(tmp_path: Path) -> None:
+def test_images_of_a_rig_have_individual_poses(tmp_path: Path) -> None:
     rig_from_world = pycolmap.Rigid3d(
         pycolmap.Rotation3d(rotation_from_opk(np.array([[-40.0, 5.0, 60.0]]))[0]),
         np.array([1.0, 2.0, 3.0]),

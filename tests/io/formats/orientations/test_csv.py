@@ -34,7 +34,7 @@ def test_poses_are_read_with_their_deviations(tmp_path: Path) -> None:
     np.testing.assert_allclose(poses.sd_angle_deg, [0.4])
 
 
-def test_a_frame_that_stands_twice_is_refused_with_both_lines(tmp_path: Path) -> None:
+def test_a_duplicate_frame_is_refused_with_both_line_numbers(tmp_path: Path) -> None:
     path = _write(tmp_path, _HEADER, "a.jpg,1,2,3,4,5,6", "b.jpg,1,2,3,4,5,6", "a.jpg,1,2,3,4,5,6")
     with pytest.raises(KgcpError, match=r"line 4: frame 'a\.jpg' is also in line 2"):
         read_reference_poses(path)
@@ -60,6 +60,6 @@ def test_opk_agrees_with_a_published_adjustment() -> None:
     np.testing.assert_allclose(world_to_camera, published, atol=2e-6)
 
 
-def test_opk_round_trip() -> None:
+def test_opk_angles_are_read_back_as_they_were_written() -> None:
     opk = np.array([[3.0, -4.0, 170.0], [-170.0, 60.0, -20.0]])
     np.testing.assert_allclose(opk_from_rotation(rotation_from_opk(opk)), opk, atol=1e-10)

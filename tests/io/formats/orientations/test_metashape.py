@@ -75,7 +75,7 @@ def test_metashape_s_world_is_geocentric_whatever_the_chunk_s_crs(
         read_reference_poses(path, OrientationFileOptions(crs="EPSG:32631"), crs="EPSG:32631")
 
 
-def test_metashape_s_local_coordinates_are_of_the_crs_that_is_stated(
+def test_metashape_s_local_coordinates_are_taken_in_the_stated_crs(
     tmp_path: Path, truth: Truth, check: Check
 ) -> None:
     path = tmp_path / "cameras.xml"
@@ -99,7 +99,7 @@ def test_metashape_s_local_coordinates_are_of_the_crs_that_is_stated(
         (" 0 0 0 1</transform>", "</transform>", "transform: holds '.*' instead of 16 finite"),
     ],
 )
-def test_a_damaged_metashape_file_is_explained(
+def test_a_damaged_metashape_file_is_refused_with_the_reason(
     tmp_path: Path, truth: Truth, old: str, new: str, words: str
 ) -> None:
     path = tmp_path / "cameras.xml"

@@ -56,7 +56,7 @@ def geocentric(lon_deg: float, lat_deg: float, height: float) -> tuple[float, fl
     return level * np.cos(lon), level * np.sin(lon), (normal * (1 - e2) + height) * np.sin(lat)
 
 
-def test_opensfm_s_world_is_level_over_its_reference(
+def test_opensfm_coordinates_are_a_level_frame_at_the_reference(
     tmp_path: Path, truth: Truth, check: Check, topocentric: Part
 ) -> None:
     path = tmp_path / "reconstruction.json"
@@ -71,7 +71,7 @@ def test_opensfm_s_world_is_level_over_its_reference(
     )
 
 
-def test_the_reference_may_stand_beside_and_reconstructions_must_share_it(
+def test_the_reference_may_be_in_a_file_beside_and_must_be_common(
     tmp_path: Path, truth: Truth, check: Check, topocentric: Part
 ) -> None:
     path = tmp_path / "reconstruction.json"
@@ -87,7 +87,7 @@ def test_the_reference_may_stand_beside_and_reconstructions_must_share_it(
         read_reference_poses(path, crs="EPSG:32631")
 
 
-def test_opendronemap_s_overwritten_file_is_utm_less_an_offset(
+def test_opendronemap_s_overwritten_file_is_read_as_utm_minus_an_offset(
     tmp_path: Path, truth: Truth, check: Check, world_to_camera: Invert, topocentric: Part
 ) -> None:
     rotation, shift = world_to_camera(truth["utm"] - OFFSET, truth["utm_from_photo"])
@@ -147,7 +147,7 @@ def geojson(truth: Truth, world_to_camera: Invert) -> Part:
     return {"type": "FeatureCollection", "features": features}
 
 
-def test_shots_are_centres_in_the_utm_zone_that_fits(
+def test_shots_are_read_as_centres_in_the_matching_utm_zone(
     tmp_path: Path, truth: Truth, check: Check, world_to_camera: Invert
 ) -> None:
     path = tmp_path / "shots.geojson"

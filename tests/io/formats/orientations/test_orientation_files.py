@@ -57,7 +57,7 @@ def test_every_format_has_a_sample() -> None:
 
 
 @pytest.mark.parametrize("form", sorted(SAMPLES))
-def test_the_content_tells_the_format_whatever_the_name(tmp_path: Path, form: str) -> None:
+def test_the_format_is_recognised_by_content_and_not_by_name(tmp_path: Path, form: str) -> None:
     path = tmp_path / "poses"
     sample = SAMPLES[form]
     path.write_text(sample if isinstance(sample, str) else json.dumps(sample))
@@ -93,7 +93,7 @@ def test_a_file_of_no_format_is_refused(tmp_path: Path, content: str) -> None:
         ("none.jpg", "x/a.jpg", "none.jpg"),
     ],
 )
-def test_other_programs_know_frames_by_less_than_their_path(
+def test_frames_match_names_without_folder_or_extension(
     tmp_path: Path, names: str, frames: str, expected: str
 ) -> None:
     path = tmp_path / "external.txt"
@@ -101,13 +101,13 @@ def test_other_programs_know_frames_by_less_than_their_path(
     assert read_reference_poses(path, frames=frames.split()).frames == (expected,)
 
 
-def test_the_csv_file_names_frames_by_their_whole_path(tmp_path: Path) -> None:
+def test_the_csv_file_must_name_frames_by_their_whole_path(tmp_path: Path) -> None:
     path = tmp_path / "reference.csv"
     path.write_text("frame,x,y,z,omega_deg,phi_deg,kappa_deg\na.jpg,1,2,3,0,0,0\n")
     assert read_reference_poses(path, frames=("x/a.jpg", "y/a.jpg")).frames == ("a.jpg",)
 
 
-def test_names_that_fit_twice_are_refused(tmp_path: Path) -> None:
+def test_names_that_match_two_frames_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "external.txt"
     path.write_text("imageName X Y Z Omega Phi Kappa\na.jpg 1 2 3 0 0 0\n")
     with pytest.raises(KgcpError, match=r"image 'a.jpg' may be 'x/a.jpg' or 'y/a.jpg'; rename"):
@@ -117,7 +117,7 @@ def test_names_that_fit_twice_are_refused(tmp_path: Path) -> None:
         read_reference_poses(path, frames=("x/a.jpg",))
 
 
-def test_deviations_turn_with_the_axes(tmp_path: Path) -> None:
+def test_deviations_are_rotated_with_the_axes(tmp_path: Path) -> None:
     # South of the equator and turned by 90°: EPSG:2053 counts westing and southing.
     path = tmp_path / "reference.csv"
     path.write_text(
@@ -149,7 +149,7 @@ def test_a_missing_grid_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "content", ["", "no such thing\n", "[1, 2]", "{}", "<a/>", "\x00\x01", "a,b\n1,2\n", "[]"]
 )
-def test_a_format_that_is_named_wrongly_is_a_line_about_the_file(
+def test_a_wrong_format_name_is_a_one_line_error_about_the_file(
     tmp_path: Path, form: str, content: str
 ) -> None:
     path = tmp_path / "poses"

@@ -64,7 +64,7 @@ def test_pix4d_s_local_coordinates_need_their_offset(
         read_reference_poses(path, OrientationFileOptions(offset_file=offset))
 
 
-def test_a_published_pose_of_pix4d(tmp_path: Path) -> None:
+def test_a_published_pose_of_pix4d_is_read(tmp_path: Path) -> None:
     path = tmp_path / "external.txt"
     path.write_text(
         "imageName X Y Z Omega Phi Kappa\n"
@@ -181,7 +181,9 @@ def test_opf_in_feet_has_heights_of_metres(tmp_path: Path, truth: Truth, check: 
     check(read_reference_poses(path, crs="EPSG:2263"), expected, truth["utm_from_photo"])
 
 
-def test_opf_says_what_it_lacks(tmp_path: Path, truth: Truth) -> None:
+def test_an_incomplete_opf_project_is_refused_with_what_it_lacks(
+    tmp_path: Path, truth: Truth
+) -> None:
     scene = scene_of("EPSG:32631", np.ones(3), np.zeros(3), swap=True)
     path = opf_project(tmp_path, truth["utm"], truth["utm_from_photo"], scene)
     with pytest.raises(KgcpError, match="crs: has the axes east and north with swap_xy true"):

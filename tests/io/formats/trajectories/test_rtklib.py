@@ -61,7 +61,7 @@ def calendar_rows() -> tuple[str, ...]:
     return (f"2015/06/01 00:00:00.000   {CELLS[0]}", f"2015/06/01 00:00:00.200   {CELLS[1]}")
 
 
-def test_the_literal_sample(tmp_path: Path) -> None:
+def test_a_literal_rtklib_sample_is_read(tmp_path: Path) -> None:
     epochs = read_rtklib(write(tmp_path, calendar_rows()), COURSE)
     assert_allclose(epochs.time_s, [FIRST_S, FIRST_S + 0.2], atol=1e-6)
     assert_allclose(epochs.position[0], [19.056534073, 47.480954411, 181.7826], rtol=0, atol=1e-12)
@@ -91,7 +91,9 @@ def test_the_literal_sample(tmp_path: Path) -> None:
         ("JST", "1847  86400.000", datetime(2015, 5, 31, 15, tzinfo=UTC)),
     ],
 )
-def test_time_systems(tmp_path: Path, clock: str, row_clock: str, unix_s: datetime) -> None:
+def test_times_of_all_time_systems_are_converted(
+    tmp_path: Path, clock: str, row_clock: str, unix_s: datetime
+) -> None:
     later = "2030" if row_clock.startswith("1847") else "2026/06/01"
     second = f"{later} 0.0" if later == "2030" else f"{later} 00:00:00.000"
     rows = (f"{row_clock}  {CELLS[0]}", f"{second}  {CELLS[1]}")
@@ -101,7 +103,7 @@ def test_time_systems(tmp_path: Path, clock: str, row_clock: str, unix_s: dateti
 
 @pytest.mark.parametrize("separator", ["   ", ",", ";", "\t", ", "])
 @pytest.mark.parametrize("clock", ["2015/06/01 00:00:00.{}00", "1847{sep}86400.{}"])
-def test_separators(tmp_path: Path, separator: str, clock: str) -> None:
+def test_all_separators_of_rtklib_are_read(tmp_path: Path, separator: str, clock: str) -> None:
     def row(tenths: int, cells: str) -> str:
         time = clock.format(tenths, sep=separator)
         return separator.join((time, *cells.split()))
@@ -113,7 +115,7 @@ def test_separators(tmp_path: Path, separator: str, clock: str) -> None:
     assert_allclose(epochs.position[1], [19.056534073, 47.480964411, 181.8826], rtol=0, atol=1e-12)
 
 
-def test_a_week_ends_in_the_file(tmp_path: Path) -> None:
+def test_gps_weeks_may_change_within_the_file(tmp_path: Path) -> None:
     rows = tuple(f"{clock} {CELLS[0]}" for clock in ("1846 604799.8", "1847 0.0", "1847 0.2"))
     epochs = read_rtklib(write(tmp_path, rows), COURSE)
     assert_allclose(np.diff(epochs.time_s), 0.2, atol=1e-6)
@@ -121,7 +123,7 @@ def test_a_week_ends_in_the_file(tmp_path: Path) -> None:
     assert_allclose(read_rtklib(write(tmp_path, stale), COURSE).time_s, epochs.time_s)
 
 
-def test_degrees_minutes_seconds_and_velocities(tmp_path: Path) -> None:
+def test_degrees_minutes_seconds_and_velocity_columns_are_read(tmp_path: Path) -> None:
     names = NAMES.replace("latitude(deg)", "latitude(d'\")").replace(
         "longitude(deg)", "longitude(d'\")"
     )
@@ -165,7 +167,7 @@ def test_ecef_has_its_own_axes(tmp_path: Path) -> None:
     assert_allclose(trajectory.cov_position_m2[0], expected, atol=1e-12)
 
 
-def test_covariances_turn_from_true_to_grid_north(tmp_path: Path) -> None:
+def test_covariances_are_rotated_from_true_to_grid_north(tmp_path: Path) -> None:
     # 7.6 degrees east of the zone's meridian, to have a convergence worth the name
     rows = tuple(
         f"2015/06/01 00:00:0{second}.0 60.0 {16.6 + second * 1e-5} 100.0 1 9"
@@ -240,7 +242,7 @@ def test_covariances_survive_the_rounding_to_tenths_of_a_millimetre(
         (calendar_rows(), NAMES.replace("height(m)", "alt(m)"), ("lacks height",)),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(
+def test_wrong_files_are_a_one_line_error(
     tmp_path: Path, rows: tuple[str, ...], names: str, words: tuple[str, ...]
 ) -> None:
     with pytest.raises(KgcpError) as caught:
@@ -272,7 +274,7 @@ def test_heights_of_an_unknown_geoid_and_other_datums_are_refused(
     assert read_rtklib(path, named).crs == "EPSG:4301"
 
 
-def test_without_attitude_nothing_is_guessed(tmp_path: Path) -> None:
+def test_a_file_without_attitude_is_refused_unless_the_course_is_to_be_used(tmp_path: Path) -> None:
     path = write(tmp_path, calendar_rows())
     with pytest.raises(KgcpError, match=r'no attitude.*attitude = "course" and sd_attitude_deg'):
         read_trajectory(path, "EPSG:25834", TrajectoryFileOptions(format="rtklib"))

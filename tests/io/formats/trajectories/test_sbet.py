@@ -77,7 +77,7 @@ def test_utc_needs_no_leap_seconds(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_the_format_lacks_has_to_be_said(
+def test_information_that_sbet_lacks_has_to_be_stated(
     tmp_path: Path, notation: TrajectoryFileOptions, words: tuple[str, ...]
 ) -> None:
     path = write(tmp_path, record(604799.5), record(0.0))
@@ -91,7 +91,7 @@ def test_what_the_format_lacks_has_to_be_said(
     ("wander", "heading"),
     [(Wander.IGNORE, 0.3), (Wander.SUBTRACT, 0.3 - 0.4 + 2.0 * np.pi), (Wander.ADD, 0.7)],
 )
-def test_what_the_wander_angle_means_has_to_be_said(
+def test_the_meaning_of_the_wander_angle_has_to_be_stated(
     tmp_path: Path, wander: Wander, heading: float
 ) -> None:
     attitude = (0.0, 0.0, 0.3)
@@ -138,7 +138,7 @@ def test_accuracies_are_interpolated_also_over_the_week_s_end(tmp_path: Path) ->
         (accuracy(604799.0, -1.0) + accuracy(604799.5), "negative or not finite"),
     ],
 )
-def test_accuracies_of_something_else_are_refused(
+def test_an_accuracy_file_that_does_not_fit_is_refused(
     tmp_path: Path, content: bytes, words: str
 ) -> None:
     path = write(tmp_path, record(604799.0), record(604799.5))
@@ -162,7 +162,7 @@ def test_accuracies_of_something_else_are_refused(
         ([record(604799.0), record(604799.5)[:-8]], ("264 bytes", "136 bytes")),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(
+def test_wrong_files_are_a_one_line_error(
     tmp_path: Path, records: list[bytes], words: tuple[str, ...]
 ) -> None:
     with pytest.raises(KgcpError) as caught:
@@ -173,7 +173,7 @@ def test_what_is_wrong_is_said_in_one_line(
         assert word in message
 
 
-def test_other_files_of_as_many_bytes_are_not_taken_for_it(tmp_path: Path) -> None:
+def test_other_files_of_the_same_size_are_not_taken_for_sbet(tmp_path: Path) -> None:
     for name, content in (("zeros", bytes(272)), ("big", struct.pack(">17d", *range(1, 18)) * 2)):
         path = write(tmp_path, content, name=name)
         with pytest.raises(KgcpError, match="is not a trajectory of a known format"):

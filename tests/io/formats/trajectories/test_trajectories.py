@@ -78,7 +78,7 @@ def test_standard_deviations_are_optional_by_group(tmp_path: Path) -> None:
         ((), ("empty",)),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(
+def test_wrong_files_are_a_one_line_error(
     tmp_path: Path, lines: tuple[str, ...], words: tuple[str, ...]
 ) -> None:
     path = _write(tmp_path, *lines)
@@ -149,7 +149,7 @@ def test_times_that_contradict_their_clock_are_refused(
     assert "\n" not in str(caught.value)
 
 
-def test_a_csv_in_degrees_comes_to_the_flight_s_grid(tmp_path: Path) -> None:
+def test_a_csv_in_degrees_is_converted_to_the_flight_s_grid(tmp_path: Path) -> None:
     # On the zone's central meridian: easting 500 000, and the meridian's arc times 0.9996. The arc
     # to 45 degrees on GRS 80 is 4 984 944.378 m.
     rows = [f"{second},9,45,100,1,2,3,0.01,0.02,0.03" for second in (0, 1)]
@@ -186,7 +186,7 @@ def test_a_csv_may_be_earth_centred(tmp_path: Path) -> None:
     np.testing.assert_allclose(trajectory.attitude_deg[0], [1, 2, 3])  # of the level there
 
 
-def test_a_crs_of_no_datum_has_no_exact_way(tmp_path: Path) -> None:
+def test_a_crs_without_a_datum_is_refused(tmp_path: Path) -> None:
     path = _write(tmp_path, _HEADER, "0,5e5,5e6,100,1,2,3", "1,5e5,5e6,100,1,2,3")
     local = "+proj=utm +zone=32 +ellps=GRS80 +type=crs"
     with pytest.raises(KgcpError, match="is not known exactly; give a CRS of the flight's datum"):
@@ -214,7 +214,7 @@ def test_heights_above_a_geoid_need_its_grid(tmp_path: Path) -> None:
         read_trajectory(path, "EPSG:4326+5773", TrajectoryFileOptions(crs="EPSG:4979"))
 
 
-def test_a_point_out_of_this_world_is_named(tmp_path: Path) -> None:
+def test_a_point_that_cannot_be_transformed_is_named(tmp_path: Path) -> None:
     rows = ("0,9,45,100,1,2,3", "1,9,450,100,1,2,3")
     with pytest.raises(KgcpError, match=r"vehicle.csv: the point \(9, 450, 100\) of epoch 2"):
         read_trajectory(
@@ -292,7 +292,9 @@ _SAME_PLACES: dict[str, tuple[bytes, TrajectoryFileOptions]] = {
 
 
 @pytest.mark.parametrize("kind", FORMATS.names)
-def test_all_formats_say_the_same_recognised_or_named(tmp_path: Path, kind: str) -> None:
+def test_formats_give_the_same_result_whether_recognised_or_named(
+    tmp_path: Path, kind: str
+) -> None:
     content, options = _SAME_PLACES[kind]
     path = tmp_path / "vehicle"
     path.write_bytes(content)

@@ -41,7 +41,7 @@ def row(time: str, quaternion: tuple[float, ...], position: tuple[float, ...] = 
     ("quaternion", "heading"),
     [(NORTH, 0.0), (tuple(-q for q in NORTH), 0.0), (EAST, 90.0), ((0.0, 1.0, 0.0, 0.0), 270.0)],
 )
-def test_headings_are_of_the_grid_and_become_true_ones(
+def test_grid_headings_are_converted_to_true_headings(
     tmp_path: Path, quaternion: tuple[float, ...], heading: float
 ) -> None:
     path = write(
@@ -60,7 +60,7 @@ def test_headings_are_of_the_grid_and_become_true_ones(
     assert (trajectory.sd_position_m, trajectory.sd_attitude_deg) == (None, None)
 
 
-def test_quaternions_may_be_against_the_earth_s_axes(tmp_path: Path) -> None:
+def test_quaternions_may_refer_to_earth_centred_axes(tmp_path: Path) -> None:
     # On the equator at Greenwich X is up, Y east and Z north; the vehicle heads for the east.
     body = Rotation.from_matrix(np.column_stack(([0, 1, 0], [0, 0, -1], [-1, 0, 0])))
     quaternion = " ".join(f"{value:.15f}" for value in body.as_quat())
@@ -96,7 +96,7 @@ def test_roll_is_right_side_down_and_pitch_nose_up(tmp_path: Path) -> None:
     heading=st.floats(0.0, 359.0),
     easting=st.floats(300000.0, 700000.0),
 )
-def test_every_attitude_reads_back(
+def test_every_attitude_is_read_back_as_it_was_written(
     tmp_path: Path, roll: float, pitch: float, heading: float, easting: float
 ) -> None:
     longitude, latitude = Proj(CRS)(easting, 4583523.0, inverse=True)
@@ -113,7 +113,7 @@ def test_every_attitude_reads_back(
     assert (attitude[2] - heading + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_robot_s_axes_are_refused_with_the_way_out(tmp_path: Path) -> None:
+def test_axes_of_robotics_are_refused_with_a_remedy(tmp_path: Path) -> None:
     # x forward, y left, z up, heading east: the identity
     path = write(tmp_path, row("0", (0.0, 0.0, 0.0, 1.0)), row("1", (0.0, 0.0, 0.0, 1.0)))
     with pytest.raises(KgcpError, match=r"on its roof.*\(qw, qz, -qy, -qx\)"):
@@ -126,7 +126,7 @@ def test_a_robot_s_axes_are_refused_with_the_way_out(tmp_path: Path) -> None:
     assert heading == pytest.approx(expected % 360.0, abs=1e-3)
 
 
-def test_other_clocks_and_the_course(tmp_path: Path) -> None:
+def test_other_clocks_and_the_course_can_be_stated(tmp_path: Path) -> None:
     positions = [(ORIGIN[0] + 5.0 * k, ORIGIN[1], ORIGIN[2]) for k in range(4)]
     rows = [row(f"{123400 + k}.5", NORTH, position) for k, position in enumerate(positions)]
     options = TrajectoryFileOptions(
@@ -154,7 +154,7 @@ def test_other_clocks_and_the_course(tmp_path: Path) -> None:
         ((row("1777887005250", NORTH), row("1777887005251", NORTH)), ("line 1", "out of range")),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(
+def test_wrong_files_are_a_one_line_error(
     tmp_path: Path, rows: tuple[str, ...], words: tuple[str, ...]
 ) -> None:
     with pytest.raises(KgcpError) as caught:
