@@ -48,7 +48,7 @@ poses = "reference.csv"
 
 
 def camera_table(camera: Camera) -> str:
-    """Return the table of a camera, which does not say its response."""
+    """Return the table of a camera without its response."""
     values = {name: getattr(camera, name) for name in ("width", "height", *CALIBRATION_PARAMETERS)}
     lines = [f"{name} = {value}" for name, value in values.items() if value]
     return "\n".join(["[camera]", *lines, ""])

@@ -1,4 +1,4 @@
-"""One order of axes everywhere: every transformer is asked for x = easting or longitude first."""
+"""Every transformer is created with x = easting or longitude first."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The house of docs/design.md, enforced: who may import whom, and how large a room may grow."""
+"""The rules of docs/design.md: allowed imports between layers, and sizes of folders and files."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def dotted(path: Path) -> str:
 
 
 def member(module: str) -> str:
-    """The part of the house that a module belongs to."""
+    """The member of a layer that a module belongs to."""
     parts = module.split(".")
     for length in range(len(parts), 0, -1):
         if (name := ".".join(parts[:length])) in LEVEL:
@@ -222,7 +222,7 @@ def test_no_layer_below_io_handles_files() -> None:
 
 
 def test_no_import_is_hidden() -> None:
-    """Inside a function or under TYPE_CHECKING it would hide what the house is built like."""
+    """Inside a function or under TYPE_CHECKING, an import would hide a dependency."""
     hidden = [
         f"{own} imports {each.name}"
         for own, imported in internal().items()

@@ -1,4 +1,4 @@
-"""The sample flight, measured once per session: tests plant their slips in copies of it."""
+"""The sample flight, measured once per session. Tests change copies of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames that cannot be read are rows, folders that cannot be used are lines; nothing is lost."""
+"""Unreadable frames become rows with a reason; unusable folders are one-line errors."""
 
 from __future__ import annotations
 

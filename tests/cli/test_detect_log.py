@@ -1,4 +1,4 @@
-"""What a bar that stands still says."""
+"""What the progress bar and the log of a run report."""
 
 from __future__ import annotations
 

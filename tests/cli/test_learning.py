@@ -1,4 +1,4 @@
-"""What frames say of each other: learnt from all of them, left out where that is asked for."""
+"""The tone curve is learnt from all frames of a flight, unless `--no-learn` is given."""
 
 from __future__ import annotations
 

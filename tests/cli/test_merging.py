@@ -1,4 +1,4 @@
-"""Points that are left out, and points of several flights: `kgcp export-gcp`."""
+"""`kgcp export-gcp`: excluded frames, and points of several flights."""
 
 from __future__ import annotations
 

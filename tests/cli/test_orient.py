@@ -86,7 +86,7 @@ def poses_of(folder: Path, flight: GroundFlight) -> tuple[np.ndarray, np.ndarray
 def test_a_common_error_of_all_diameters_displaces_no_pose(
     tmp_path: Path, stated_m: float, words: str
 ) -> None:
-    """Nobody states how well these rings are printed: 'place' measures it by such poses."""
+    """The accuracy of these prints is not stated: 'place' measures it with such poses."""
     flight = GroundFlight(stated_diameter_m=stated_m, frames=6)
     folder = flight.write(tmp_path / "flight", sd_position_m=0.002)
     result = run("orient", folder, "--json")
@@ -170,7 +170,7 @@ def test_a_failure_to_orient_most_frames_is_reported(tmp_path: Path) -> None:
 def test_frames_with_two_of_four_names_exchanged_are_not_oriented(
     tmp_path: Path, pair: str, options: tuple[str, ...]
 ) -> None:
-    """These frames are refused: two of four do not tell which two are right."""
+    """These frames are refused, because four names do not show which two of them are right."""
     one, other = tuple(pair)
     renamed = {(frame, a): b for frame in (0, 3) for a, b in ((one, other), (other, one))}
     flight = GroundFlight(renamed=renamed, frames=6)
@@ -264,8 +264,8 @@ def test_a_misplaced_target_is_reported_once_for_all_frames(tmp_path: Path) -> N
     folder = GroundFlight(wrong={(frame, "B"): np.array([0.5, 0.3, 0.0]) for frame in range(5)})
     result = run("orient", folder.write(tmp_path / "flight"))
     assert result.exit_code == 0, result.stderr
-    told = "B left out in 5 of 12 frames, first in f_000.png\n"
-    assert told in result.stderr
+    message = "B left out in 5 of 12 frames, first in f_000.png\n"
+    assert message in result.stderr
     assert result.stderr.count("left out") == 1
 
 

@@ -64,7 +64,7 @@ def test_targets_are_placed_and_their_diameters_measured(tmp_path: Path) -> None
 
 @pytest.mark.usefixtures("_no_figures")
 def test_a_rolling_shutter_needs_times(tmp_path: Path) -> None:
-    """What the camera moves while a frame is read is not known, and the deviations say so."""
+    """The camera's motion during the readout is unknown, and the deviations contain it."""
     folder = GroundFlight().write(tmp_path / "flight")
     still = json.loads(run(folder, "--json").stdout)["targets"][0]
     settings = folder / "flight.toml"
@@ -175,7 +175,7 @@ def test_a_target_that_was_moved_is_placed_by_most_frames_or_not_at_all(
 
 
 def stepped(names: str, steps_m: FloatArray, *, seed: int = 1) -> GroundFlight:
-    """A flight whose reference poses are off by (12, 3) metres: all targets are, alike."""
+    """A flight whose reference poses, and so all targets alike, are off by (12, 3) metres."""
     offsets_m = GroundFlight().offsets_m[: len(names)]
     rotations = GroundFlight(seed=seed).rotations
     wrong = {

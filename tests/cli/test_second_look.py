@@ -1,4 +1,4 @@
-"""`kgcp detect` on a smooth passage with one frame in haze: the neighbours tell where to look."""
+"""`kgcp detect` on a smooth passage with one frame in haze, predicted by its neighbours."""
 
 from __future__ import annotations
 

@@ -150,7 +150,7 @@ def test_options_of_effects_reach_the_flight_and_its_readme(tmp_path: Path) -> N
     "options", ["--phone", "--sharpening 0 1 --phone", "--sharpening 0.8 1.2 --no-phone"]
 )
 def test_sharpening_is_the_phones_unless_it_is_given(tmp_path: Path, options: str) -> None:
-    """The README's command makes the same flight, also with what its preset has of itself."""
+    """The README's command makes the same flight, also with the settings of its preset."""
     name = "phone" if "--no-phone" in options else "clean"
     out = tmp_path / "flight"
     arguments = ["--preset", name, "--frames", "1", "--jobs", "1", *options.split()]

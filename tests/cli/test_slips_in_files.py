@@ -1,4 +1,4 @@
-"""Files as spreadsheets, editors and cameras write them: one line with the cause and the remedy."""
+"""Files spoiled by spreadsheets, editors and cameras: one line with the cause and the remedy."""
 
 from __future__ import annotations
 

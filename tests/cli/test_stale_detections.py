@@ -1,4 +1,4 @@
-"""flight.toml changes after `kgcp detect`: what the table depends on is refused, nothing else."""
+"""Changes of flight.toml after `kgcp detect` are refused only if the table depends on them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from tests.cli.conftest import FRAMES, SampleFlight, copied_sample
 
-# name: changes of flight.toml, what the line of error says
+# name: changes of flight.toml, text of the one-line error
 CHANGES = {
     "diameter": (
         [("outer_diameter_m = 0.9\n", "outer_diameter_m = 0.95\n")],
@@ -45,7 +45,7 @@ CHANGES = {
         "[[target]] B is new, [[target]] A is gone, [[target]] A-inner replica_of (A → B)",
     ),
 }
-# What later commands read anew, and what says nothing.
+# Keys that later commands read again, and formatting.
 HARMLESS = {
     "comment": [("[camera]", "# measured twice\n[camera]")],
     "spelling": [("fx = 1903.0", "fx = 1.903e3"), ("[0, 43, 78, 180]", "[180, 0, 43, 78]")],

@@ -1,4 +1,4 @@
-"""Whose clock a frame's time is: never EXIF's in silence beside a times file."""
+"""Where a frame's time comes from: beside a times file, EXIF's is never used unasked."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs that measure nothing say why: the code, its mirror image, swapped black and white."""
+"""Runs that measure nothing report the cause: another or mirrored code, black and white swapped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every reader against its damaged seeds, and against all that fuzzing has found: `fuzz/`."""
+"""Every reader with damaged seed files, and with the files that fuzzing has found (`fuzz/`)."""
 
 from __future__ import annotations
 

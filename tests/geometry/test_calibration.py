@@ -1,4 +1,4 @@
-"""The calibration's covariance: what it may be, and how the image follows the parameters."""
+"""The calibration's covariance: valid matrices, and derivatives of the image by the parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The camera against OpenCV's own projection, and against itself there and back."""
+"""The camera against OpenCV's projection, and distortion against its inverse."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Grids through the lens at once, against single pixels."""
+"""Undistorting grids of pixels at once, compared with single pixels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which normal the frames before and after make likely, and a measurement weighed anew by that."""
+"""Which normal the frames before and after make likelier, and how a measurement changes by it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where targets must be: predictions are as good as they say."""
+"""Predicted places of targets: errors agree with the stated deviations."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def test_unpredictable_frames_leave_the_a_priori_rotation() -> None:
 
 
 def test_deviations_are_those_of_a_restless_camera() -> None:
-    """Velocities of a camera that wobbles are off by what the frames around say."""
+    """Errors of a wobbling camera's rates agree with the deviations from neighbours."""
     wobble_rad = 0.01
     rotations = rotations_between_frames(TIME_S, *turning(np.zeros(3), wobble_rad), A_PRIORI)
     off = [np.array(rotation.velocity_rad_s) / rotation.sd_rad_s for rotation in rotations[1:-1]]

@@ -189,7 +189,7 @@ def photograph() -> Callable[..., GreyArray]:
 
 @pytest.fixture(scope="session")
 def start_near() -> Callable[..., InitialPose]:
-    """What the search might say: a per cent, some tenths of a pixel, three degrees."""
+    """A start with the errors of the search: a per cent, some tenths of a pixel, three degrees."""
 
     def observe(camera: Camera, pose: Pose, rng: np.random.Generator) -> InitialPose:
         error = rng.normal(0.0, (0.3, 0.3, 0.01, 0.05, 0.05, 0.01))

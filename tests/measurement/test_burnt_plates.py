@@ -60,7 +60,7 @@ def test_burnt_white_in_full_light_is_not_masked(
     start_near: Callable[..., InitialPose],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Clipped white is darker than the light on it says; it was taken for what hides the plate."""
+    """Clipped white is darker than its modelled light; it was once taken for a hidden part."""
     shares = []
 
     def select(*asked: Any, **more: Any) -> Sample:  # noqa: ANN401 - whatever it is asked

@@ -1,4 +1,4 @@
-"""Misses name what can be seen in the image; targets hidden by others are not looked into."""
+"""The reasons of misses name what is visible in the image."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Targets that are dirty, in a shadow or partly hidden: nothing is far off and sure of itself."""
+"""Dirty, shaded or partly hidden targets: no large error has a small deviation."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def test_a_small_patch_over_the_edge_costs_little(
 def test_deviations_cover_a_large_patch_over_the_edge(
     measure: Callable[..., list[Outcome]], angle_deg: float
 ) -> None:
-    """A fifth of the outline: the fit leans towards the hole, and its deviation says so."""
+    """A fifth of the outline: the fit is drawn towards the hole, and its deviation covers this."""
     patch = rectangle(on_circle(0.42, angle_deg), 0.4, 0.6, angle_deg), 0.35
     check(measure(with_layers(patch)), sigmas=6.0, percent=3.0)
 

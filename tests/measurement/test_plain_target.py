@@ -1,4 +1,4 @@
-"""Plain targets in one rendered frame: found where they must be, and refused elsewhere."""
+"""Plain targets in one rendered frame: found at the predicted place, and refused elsewhere."""
 
 from __future__ import annotations
 
@@ -210,8 +210,8 @@ def test_a_free_normal_allows_two_centres(target: PlainTarget, tilt_deg: float) 
     assert off_px @ np.linalg.solve(cov_px2, off_px) < 12.0
     tilt_rad = math.radians(tilt_deg)
     half_px = RADIUS_PX**2 / CAMERA.fx * 0.5 * math.sin(2.0 * tilt_rad)
-    is_told = target.shape is Shape.RING and tilt_deg == 20.0
-    least_px, most_px = (0.0, 0.005) if is_told else (half_px, 1.2 * half_px + 0.015)
+    is_separable = target.shape is Shape.RING and tilt_deg == 20.0
+    least_px, most_px = (0.0, 0.005) if is_separable else (half_px, 1.2 * half_px + 0.015)
     assert least_px**2 < np.trace(cov_px2) < most_px**2
     assert outcome.image is not None
     centroid, *_ = circle_images(CAMERA, circles_about(pose, np.array(target.radii_m))).moments
@@ -221,8 +221,8 @@ def test_a_free_normal_allows_two_centres(target: PlainTarget, tilt_deg: float) 
     assert abs(off_m) < 4.0 * outcome.uncertainty.sd_distance_m < 0.02 * pose.distance_m
     if tilt_deg:
         assert outcome.alternative is not None
-        assert (outcome.alternative.ambiguity > 20.0) is is_told
-        assert (outcome.alternative.ambiguity < 0.5) is not is_told
+        assert (outcome.alternative.ambiguity > 20.0) is is_separable
+        assert (outcome.alternative.ambiguity < 0.5) is not is_separable
         normals = (outcome.pose.normal, outcome.alternative.pose.normal)
         assert max(float(each @ pose.normal) for each in normals) > math.cos(math.radians(1.5))
 

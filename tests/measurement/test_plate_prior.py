@@ -1,4 +1,4 @@
-"""The prior on the plate's normal: which of two poses, and never another value."""
+"""The prior on the plate's normal chooses one of two poses and changes no other value."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def measure(
 
 @cache
 def frame(number: int) -> tuple[Pose, GreyArray, Measurement]:
-    """The truth, the image and what the image alone says."""
+    """The true pose, the image, and the measurement from the image alone."""
     rng = np.random.default_rng(number)
     pose = far_pose(rng)
     grey = photograph(pose, rng)

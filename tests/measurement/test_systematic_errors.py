@@ -1,4 +1,4 @@
-"""Common errors against brute force: another calibration, the same image, the pose solved anew."""
+"""Common errors compared with brute force: the pose solved again with another calibration."""
 
 from __future__ import annotations
 

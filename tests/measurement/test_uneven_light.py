@@ -312,7 +312,7 @@ def test_edges_that_a_phone_makes_steeper_have_a_tone_of_their_own(
 def test_burnt_white_that_a_phone_darkened_counts_as_clipped(
     start_near: StartNear,
 ) -> None:
-    """Taken for what it seems, the RMS error of these plates was 0.0115 %."""
+    """If the grey value counts as the plate's level, the RMS error of these plates is 0.0115 %."""
     percent, sigmas = errors_by_phone(start_near, Phone(), gain=1.5, radius_px=110.0)
     assert 0.0012 < percent < 0.008
     assert 0.35 < sigmas < 1.7
@@ -391,7 +391,7 @@ def test_pixels_beside_edges_tie_the_levels_of_large_rings_together(
 def test_dirt_on_a_small_ring_is_recognised_by_residuals_along_edges(
     photograph: Photograph, start_near: StartNear, monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
-    """Cells of 8 px say too little there, and the light was taken for even: 0.25 % off."""
+    """Cells of 8 px do not show it, and the light was once taken for even: 0.25 % off."""
     rng = np.random.default_rng(seed)
     pose = some_pose(rng)
     pose = Pose(pose.rotation, 3.5 * pose.translation_m)

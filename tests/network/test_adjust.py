@@ -1,4 +1,4 @@
-"""The adjustment finds the truth, states how well, and is not led astray by wrong discs."""
+"""The adjustment recovers the truth, states its accuracy, and is robust against wrong discs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Photographs from nearly one pose are of one place, and a place tells the model's errors once."""
+"""Photographs from nearly one pose are of one place, whose model errors count once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""EO devices: which point is which; symmetric devices, and discs that do not fit, are refused."""
+"""EO devices: identification of points; symmetric devices and misfitting discs are refused."""
 
 from __future__ import annotations
 

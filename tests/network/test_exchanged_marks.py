@@ -1,4 +1,4 @@
-"""Marks with each other's names are told from right ones on ground that is anything but flat."""
+"""Marks with exchanged names are found on ground that is not flat."""
 
 from __future__ import annotations
 

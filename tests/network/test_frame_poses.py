@@ -1,4 +1,4 @@
-"""Frames oriented by rings each of which is printed larger or smaller by itself."""
+"""Frames oriented by rings with individual errors of their printed diameters."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_diameters_off_by_half_are_reported_even_with_an_unknown_focal_length(wr
 
 
 def test_a_print_accuracy_in_sightings_and_flight_counts_once() -> None:
-    """Targets near each other: how far away the camera is, their distances say."""
+    """Targets near each other: their measured distances determine the camera's distance."""
     offsets_m = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.2, 0.0]])
     seen = POSE.in_camera(offsets_m)
     distances_m = np.linalg.norm(seen, axis=1)

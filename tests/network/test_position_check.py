@@ -1,4 +1,4 @@
-"""Positions of static targets against each other: which one is wrong, and when none is."""
+"""Comparison of the positions of static targets: which one is wrong, and when none is."""
 
 from __future__ import annotations
 
@@ -63,11 +63,11 @@ def test_the_wrong_position_is_named_among_few_others(
 ) -> None:
     """Four targets hardly tell which of them is wrong, six do."""
     found = [checked(targets, seed, off_m=0.1) for seed in range(40)]
-    told = [(true, wrong) for true, wrong in found if wrong is not None]
-    assert len(told) >= 28
-    assert all(true in wrong.targets for true, wrong in told)
-    assert named[0] < float(np.mean([len(wrong.targets) for _, wrong in told])) < named[1]
-    off_m = [wrong.off_m for true, wrong in told if wrong.targets[0] == true]
+    found_wrong = [(true, wrong) for true, wrong in found if wrong is not None]
+    assert len(found_wrong) >= 28
+    assert all(true in wrong.targets for true, wrong in found_wrong)
+    assert named[0] < float(np.mean([len(wrong.targets) for _, wrong in found_wrong])) < named[1]
+    off_m = [wrong.off_m for true, wrong in found_wrong if wrong.targets[0] == true]
     assert float(np.median(off_m)) == pytest.approx(0.1, rel=0.25)
 
 
@@ -81,7 +81,9 @@ def test_image_noise_other_than_stated_contradicts_no_position(sd_m: float, nois
 
 def test_a_wrong_position_is_found_with_images_worse_than_stated() -> None:
     found = [checked(6, seed, off_m=0.1, noise=10.0) for seed in range(12)]
-    told = [(true, wrong) for true, wrong in found if wrong is not None]
-    assert len(told) >= 11
-    assert all(wrong.targets[0] == true for true, wrong in told)
-    assert float(np.median([wrong.off_m for _, wrong in told])) == pytest.approx(0.1, rel=0.15)
+    found_wrong = [(true, wrong) for true, wrong in found if wrong is not None]
+    assert len(found_wrong) >= 11
+    assert all(wrong.targets[0] == true for true, wrong in found_wrong)
+    assert float(np.median([wrong.off_m for _, wrong in found_wrong])) == pytest.approx(
+        0.1, rel=0.15
+    )

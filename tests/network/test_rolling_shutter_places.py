@@ -135,7 +135,7 @@ def test_a_camera_that_flies_on_does_not_lift_the_targets() -> None:
 
 
 def test_unknown_motion_has_a_deviation_common_to_all_frames() -> None:
-    """A camera as fast as `motion_sd_deg_s` says displaces heights by about one deviation."""
+    """A camera that moves with `motion_sd_deg_s` displaces heights by about one deviation."""
     rng, z = np.random.default_rng(5), []
     for _ in range(6):
         flight, time_s = strip(HEIGHT_M * math.radians(CAMERA.motion_sd_deg_s), rng)

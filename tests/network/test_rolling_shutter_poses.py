@@ -1,4 +1,4 @@
-"""Frames of a rolling shutter, whose rows see the targets from where the camera is by then."""
+"""Poses of frames with a rolling shutter, whose rows are exposed at different camera positions."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def sightings_of(
 
 
 def drawn_motion(rng: np.random.Generator) -> FloatArray:
-    """Shift and turn, each as fast as the camera's settings say of the line of sight."""
+    """Shift and rotation, each as fast as the camera's setting for the line of sight."""
     sds = np.repeat([29.0 * SD_RAD_S, SD_RAD_S], 3)
     return np.asarray(sds * rng.standard_normal(6))
 

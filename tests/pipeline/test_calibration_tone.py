@@ -1,4 +1,4 @@
-"""What all photographs tell of the camera together is missed where it is lost."""
+"""The tone curve that all photographs of a camera share, and warnings if it is missing."""
 
 from __future__ import annotations
 

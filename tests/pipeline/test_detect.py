@@ -1,4 +1,4 @@
-"""From flight.toml to the table: what is known beforehand, and what all frames have in common."""
+"""From flight.toml to the table: priors of frames, and errors common to all frames."""
 
 from __future__ import annotations
 

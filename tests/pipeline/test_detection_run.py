@@ -1,4 +1,4 @@
-"""In which order frames are looked at, and what of it a second run takes over."""
+"""The order in which frames are examined, and what a resumed run keeps."""
 
 from __future__ import annotations
 

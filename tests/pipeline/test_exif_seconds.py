@@ -1,4 +1,4 @@
-"""Times of frames that a camera gives in whole seconds are told of, since they place nothing."""
+"""Times in whole seconds, which are too coarse to place targets, are counted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What trajectory and reference poses say about a frame before it is looked at."""
+"""Priors of a frame from trajectory and reference poses."""
 
 from __future__ import annotations
 

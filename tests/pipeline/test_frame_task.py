@@ -1,4 +1,4 @@
-"""One frame, looked at once and again: what becomes of each target's row."""
+"""The first and the second look at one frame, and the resulting row of each target."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The guess of a camera from what EXIF says."""
+"""The guess of a camera from EXIF."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wrong settings for the sample flight's rendered frames, and what export-gcp says about them."""
+"""Wrong settings for the sample flight's rendered frames, and the advice of export-gcp."""
 
 from __future__ import annotations
 

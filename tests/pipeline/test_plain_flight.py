@@ -92,7 +92,7 @@ def test_four_discs_can_orient_frames_check_a_vehicle_and_be_placed(folder: Path
     placed = place_flight(flight, options=PlaceOptions(poses=poses)).placement.targets
     assert [each.target for each in placed] == [target.name for target in FOUR]
     for each in placed:
-        # three frames side by side tell little of the scale, and say so
+        # three frames side by side hardly determine the scale, and their deviations show it
         off_m, sd_m = each.check.diameter_residual_m, each.check.sd_diameter_residual_m
         assert abs(off_m) < 3.0 * sd_m < 0.15
         assert each.check.position_chi2 is not None
@@ -218,7 +218,7 @@ def test_manual_marks_predict_plain_targets(bare: Path) -> None:
 
 
 def test_a_poor_mark_does_not_keep_a_target_from_being_found(tmp_path: Path) -> None:
-    """Four good marks orient the frame, and this says where the fifth target is."""
+    """Four good marks orient the frame, whose pose predicts the fifth target."""
     fifth = plain_target("fifth", (-1.2, 0.6), 0.8)
     made = PlainFlight(targets=(*FOUR, fifth), frames=1)
     made.write(tmp_path)

@@ -26,7 +26,7 @@ def _time_s(folder: Path, reference: str, name: str = "f.jpg") -> float | None:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A frame exposed for 1/50 s, one that does not say for how long, and one that is none."""
+    """A frame exposed for 1/50 s, one without an exposure time, and one that is no image."""
     image = Image.fromarray(np.full((64, 96), 128, np.uint8))
     image.save(tmp_path / "bare.jpg")
     exif = Image.Exif()

@@ -1,4 +1,4 @@
-"""The base of an unknown tone curve: some frames tell it, and the others are measured over it."""
+"""The base of an unknown tone curve: some frames decide it, and the others are measured over it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ FLIGHT = f'{camera_table(CAMERA)}response = "unknown"\n{RING_A}'
 
 
 class StopAfter:
-    """A listener that presses Ctrl-C after some looks, and remembers what was said."""
+    """A listener that interrupts after some frames, and records the messages."""
 
     def __init__(self, looks: int) -> None:
         self._looks = looks
@@ -77,7 +77,7 @@ def bases(monkeypatch: pytest.MonkeyPatch) -> dict[str, ToneBase | None]:
     """Remember over which base each frame was measured; None: over both."""
     asked: dict[str, ToneBase | None] = {}
 
-    def told(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
+    def examined(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
         asked[frame_input.frame] = job.tone_base
         result = examine_frame(job, frame_input)
         (outcome,) = result.outcomes
@@ -85,7 +85,7 @@ def bases(monkeypatch: pytest.MonkeyPatch) -> dict[str, ToneBase | None]:
         assert (outcome.rival is None) == (job.tone_base is not None)
         return result
 
-    monkeypatch.setattr("kgcp.pipeline.detection_run.examine_frame", told)
+    monkeypatch.setattr("kgcp.pipeline.detection_run.examine_frame", examined)
     return asked
 
 

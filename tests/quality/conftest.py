@@ -1,4 +1,4 @@
-"""A simulated flight without pixels: what instruments and detector would have said."""
+"""A simulated flight without images: the values that instruments and detector would give."""
 
 from __future__ import annotations
 

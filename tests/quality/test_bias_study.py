@@ -301,8 +301,8 @@ def test_reference_distances_are_those_when_a_rolling_shutter_exposes_the_target
         above_m,
     )
     still, moving = (
-        study_bias(attempts, poses, target_positions, camera, [_TARGET], _METHOD, told)
-        for told in (None, motions)
+        study_bias(attempts, poses, target_positions, camera, [_TARGET], _METHOD, known)
+        for known in (None, motions)
     )
     before = np.array([pair.residual_m for pair in still.measured])
     after = np.array([pair.residual_m for pair in moving.measured])

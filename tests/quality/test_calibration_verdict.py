@@ -1,4 +1,4 @@
-"""What is said of a calibration, by photographs of which only the places of discs are simulated."""
+"""The verdict on calibrations from photographs of which only the discs' moments are simulated."""
 
 from __future__ import annotations
 
@@ -120,17 +120,17 @@ def test_a_rational_model_keeps_its_terms_small_on_a_field_with_errors(points: P
     result = calibrated(views(bend_m=errors_m, noise_px=0.2 * SD_PX), points, LensModel.RATIONAL)
     assert np.abs([result.camera.k1, result.camera.k4]).max() < 0.3
     assert result.camera.fx == pytest.approx(1500.0, abs=3.0)
-    assert set(result.undetermined) >= {"k1", "k4"}  # which can hardly be told apart
+    assert set(result.undetermined) >= {"k1", "k4"}  # which can hardly be separated
 
 
 def test_the_stated_effect_of_neglected_eccentricity_equals_that_of_an_adjustment() -> None:
     made = views(noise_px=0.0)
-    told = change_if_neglected(calibrated(made))
+    stated = change_if_neglected(calibrated(made))
     tiny = replace(FIELD, diameter_m=1e-5, marks=())  # whose centroids count as centres
     radial = CalibrationSettings(PointModel.FIXED, LensModel.RADIAL)
     lost = calibrate_camera(made, tiny, (1600, 1200), radial)
-    assert abs(told["fx"]) > 0.05
-    assert told["fx"] == pytest.approx(lost.camera.fx - 1500.0, rel=0.25)
+    assert abs(stated["fx"]) > 0.05
+    assert stated["fx"] == pytest.approx(lost.camera.fx - 1500.0, rel=0.25)
 
 
 def test_a_field_that_is_not_flat_is_noticed_and_estimated() -> None:
@@ -210,18 +210,18 @@ def test_a_bowed_sheet_is_reported_and_a_larger_one_is_not(
     assert ("in height" in field.doubt) == (ratio > 0.0)
 
 
-@pytest.mark.parametrize(("stated_m", "is_told"), [(0.024, False), (0.0205, True)])
+@pytest.mark.parametrize(("stated_m", "is_reported"), [(0.024, False), (0.0205, True)])
 def test_a_wrong_stated_diameter_is_reported_and_does_no_harm(
     stated_m: float,
-    is_told: bool,  # noqa: FBT001 - a parameter of the test
+    is_reported: bool,  # noqa: FBT001 - a parameter of the test
 ) -> None:
     marks = (Mark(1, 1, stated_m, 0.01 * stated_m / 0.024),)
     field = replace(FIELD, diameter_m=stated_m, marks=marks)
     result = calibrate_camera(views(), field, (CAMERA.width, CAMERA.height), CalibrationSettings())
     verdict = judge(result, calibration_numbers(result))
-    assert ("discs are 17 % larger than stated" in verdict.sentence) == is_told
+    assert ("discs are 17 % larger than stated" in verdict.sentence) == is_reported
     measure = "Measure the diameter and the pitch of the print"
-    assert any(measure in each for each in verdict.advice) == is_told
+    assert any(measure in each for each in verdict.advice) == is_reported
     sd_px = float(np.sqrt(result.covariance.cov[0, 0]))
     assert abs(result.camera.fx - CAMERA.fx) < 3.0 * sd_px
 
@@ -375,9 +375,9 @@ def test_two_of_six_photographs_of_another_zoom_are_left_out_together() -> None:
     assert "2 photographs do not fit the others" in verdict.sentence
 
 
-@pytest.mark.parametrize(("larger", "is_told"), [(1.15, True), (1.05, False)])
+@pytest.mark.parametrize(("larger", "is_reported"), [(1.15, True), (1.05, False)])
 def test_photographs_of_another_field_are_recognised_by_their_discs(
-    larger: float, *, is_told: bool
+    larger: float, *, is_reported: bool
 ) -> None:
     """Its pitch is taken for a distance: the camera is right, and nothing else shows it."""
     made = views()
@@ -390,8 +390,8 @@ def test_photographs_of_another_field_are_recognised_by_their_discs(
         np.where(np.isin(range(6), (1, 4)), larger, 1.0), abs=1e-3
     )
     verdict = judge(result, calibration_numbers(result))
-    assert ("discs in p1, p4 have another size than in most" in verdict.sentence) == is_told
-    assert (verdict.grade is CalibrationGrade.GOOD) != is_told
+    assert ("discs in p1, p4 have another size than in most" in verdict.sentence) == is_reported
+    assert (verdict.grade is CalibrationGrade.GOOD) != is_reported
 
 
 def test_three_of_six_photographs_of_another_zoom_exclude_none() -> None:

@@ -272,7 +272,7 @@ def test_advice_names_key_and_amount_and_disappears_once_followed() -> None:
 
 
 def test_corrections_within_the_uncertainty_in_flight_toml_are_not_advised() -> None:
-    """8 cm are found just as well, but within 10 cm nobody has claimed anything else."""
+    """8 cm are found just as well, but are within an uncertainty of 10 cm in flight.toml."""
     flight = Flight(lever_m=_LEVER + _TO_THE_RIGHT, seed=1)
     for sd_m, lines in ((0.05, 1), (0.1, 0)):
         vague = replace(flight.settings, sd_lever_arm_m=(0.0, sd_m, 0.0))

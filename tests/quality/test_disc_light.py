@@ -1,4 +1,4 @@
-"""Negatives and burnt photographs are told by what light does to their levels."""
+"""Negatives and burnt photographs are recognised by how their levels change with the light."""
 
 from __future__ import annotations
 

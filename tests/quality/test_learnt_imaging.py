@@ -1,4 +1,4 @@
-"""What many frames say together: the base of an unknown tone curve, and the curve itself."""
+"""The base of an unknown tone curve, and the curve itself, learnt from many frames."""
 
 from __future__ import annotations
 
@@ -140,12 +140,12 @@ def test_the_choice_of_the_base_hardly_matters_if_most_distances_agree(
 ) -> None:
     results = [frame(f"f{k}", SRGB if k % 3 else LINE, 2.0) for k in range(frames)]
     sds_m = [5.0 if k < alike else 1.0 for k in range(frames)]  # both bases are 1 m apart
-    told = [
+    with_sds = [
         replace(result, outcomes=(replace(first_of(result), uncertainty=uncertainty(sd_m)),))
         for result, sd_m in zip(results, sds_m, strict=True)
     ]
-    assert clearly_agreed_base(told) is None
-    assert base_if_distances_agree(told) is base
+    assert clearly_agreed_base(with_sds) is None
+    assert base_if_distances_agree(with_sds) is base
 
 
 def test_frames_measured_over_one_base_take_part_in_what_is_learnt() -> None:

@@ -1,4 +1,4 @@
-"""Static targets against each other: wrong positions, exchanged names, moves, single frames."""
+"""Comparison of static targets: wrong positions, exchanged names, moves, single frames."""
 
 from __future__ import annotations
 
@@ -211,10 +211,10 @@ def test_distortions_by_a_rolling_shutter_raise_no_doubt() -> None:
     assert "B contradicts most others" in doubt.sentence
 
 
-@pytest.mark.parametrize(("off_m", "is_told"), [(0.009, False), (0.018, True)])
+@pytest.mark.parametrize(("off_m", "is_reported"), [(0.009, False), (0.018, True)])
 def test_millimetres_between_neighbours_raise_no_doubt(
     off_m: float,
-    is_told: bool,  # noqa: FBT001 - a parameter of the test
+    is_reported: bool,  # noqa: FBT001 - a parameter of the test
 ) -> None:
     """Nobody surveys better, and plates bend: also of positions that are stated as exact."""
     flight = GroundFlight(names=("A", "B"), offsets_m=np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]]))
@@ -228,13 +228,13 @@ def test_millimetres_between_neighbours_raise_no_doubt(
             "AB", (flight.positions[0], flight.positions[1] + east_m), strict=True
         )
     }
-    assert bool(check(exactly, positions)) == is_told
+    assert bool(check(exactly, positions)) == is_reported
 
 
-@pytest.mark.parametrize(("factor", "is_told"), [(1.0, False), (10.0, True)])
+@pytest.mark.parametrize(("factor", "is_reported"), [(1.0, False), (10.0, True)])
 def test_scatter_beyond_the_stated_deviations_is_reported(
     factor: float,
-    is_told: bool,  # noqa: FBT001 - a parameter of the test
+    is_reported: bool,  # noqa: FBT001 - a parameter of the test
 ) -> None:
     """Small targets, far away: what is measured of them is all there is to contradict."""
     flight, rng, sd_m = GroundFlight(), np.random.default_rng(4), 0.1
@@ -243,7 +243,7 @@ def test_scatter_beyond_the_stated_deviations_is_reported(
     )
     cov = np.diag([sd_m**2] * 3 + [1e-6] * 3)
     sightings = [replace(each, pose_cov=cov) for each in sightings]
-    assert bool(check(sightings, stated(flight))) == is_told
+    assert bool(check(sightings, stated(flight))) == is_reported
 
 
 @pytest.mark.parametrize(("frames", "cause"), [(2, Cause.SINGLE_FRAMES), (4, Cause.STATIC_TARGETS)])

@@ -1,4 +1,4 @@
-"""Plain targets: what can be one."""
+"""Plain targets: valid and impossible ones."""
 
 from __future__ import annotations
 

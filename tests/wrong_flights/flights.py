@@ -1,4 +1,4 @@
-"""Flights without pixels: the sample flight, anywhere on Earth, with whatever slip in its files.
+"""Flights without images: the sample flight, anywhere on Earth, with any mistake in its files.
 
 Measurements come from `truth.csv`: with the camera and the diameters that flight.toml names, be
 they wrong, a pose is fitted to where the true camera has put the true circles. This shares no code
@@ -112,7 +112,7 @@ def truth() -> Truth:
 
 @dataclass(frozen=True)
 class Flight:
-    """What the files of a flight say; right, until a slip replaces something.
+    """The contents of a flight's files: right, until a mistake replaces something.
 
     `camera`, `target` and the following are as in flight.toml. Places and angles of `vehicle` and
     `reference` are as in their files: x, y, z and three angles.

@@ -22,7 +22,7 @@ SHARED = Path(__file__).resolve().parents[2] / ".." / "shared" / "flights"
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a user is told.
+    """The doubts that kgcp reports.
 
     Attributes
     ----------
@@ -91,17 +91,17 @@ def test_there_are_many_slips() -> None:
 @pytest.mark.parametrize("name", WRONG)
 def test_the_cause_is_named_first(name: str, tmp_path: Path) -> None:
     make, causes = WRONG[name]
-    told = verdict(make(), tmp_path / "flight")
-    assert told.first in causes, told
-    assert told.doubts[0].remedy
+    found = verdict(make(), tmp_path / "flight")
+    assert found.first in causes, found
+    assert found.doubts[0].remedy
 
 
 @pytest.mark.parametrize(("first", "second"), PAIRS)
 def test_of_two_slips_at_least_one_is_named_first(first: str, second: str, tmp_path: Path) -> None:
     both = {**ANYWAY, **WITH_REFERENCE}
     one = both[second].make(both[first].make(flight()))
-    told = verdict(one, tmp_path / "flight")
-    assert told.first in (*both[first].causes, *both[second].causes), told
+    found = verdict(one, tmp_path / "flight")
+    assert found.first in (*both[first].causes, *both[second].causes), found
 
 
 CORRECT: dict[str, Callable[[], Flight]] = {

@@ -1,4 +1,4 @@
-"""What the script touches of Metashape's Python API 2, as its reference documents it.
+"""The part of Metashape's Python API 2 that the script uses, as its reference documents it.
 
 Every class has the attributes of the reference and no others, and every value the type that it
 names there: a wrong attribute, argument or unit of grouping is an error, as in the program.

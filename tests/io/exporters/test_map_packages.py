@@ -1,4 +1,4 @@
-"""Pix4D, OPF and OpenSfM: what a reader of the format gets out of the files."""
+"""Pix4D, OPF and OpenSfM: what readers of these formats get from the files."""
 
 from __future__ import annotations
 

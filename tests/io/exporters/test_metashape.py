@@ -1,4 +1,4 @@
-"""Metashape: what its script sets, and what its files say."""
+"""Metashape: what the script sets, and the contents of the files."""
 
 from __future__ import annotations
 

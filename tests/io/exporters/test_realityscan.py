@@ -1,4 +1,4 @@
-"""RealityScan: what its help says that it reads."""
+"""RealityScan: the files have the form that its help describes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All formats together: what they write, how fast, and that it fits together again."""
+"""All formats together: their files, their speed, and that points, images and cameras agree."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def test_exported_points_images_and_cameras_agree(make_points: Factory) -> None:
 def test_how_tos_of_packages_with_distances_explain_their_common_error(
     points: MapPoints, tmp_path: Path, name: str
 ) -> None:
-    """1.23 cm of 79 m are 0.016 % of the distance; assumed, where flight.toml says nothing."""
+    """1.23 cm of 79 m are 0.016 % of the distance; without a stated value, one is assumed."""
     silent = tuple(replace(point, sd_common_distance_m=None) for point in points.gcps)
     for some, words in (
         (points, "the share is 0.016 % here"),

@@ -1,4 +1,4 @@
-"""Packages get accuracies that an adjustment can use; tables and maps keep what was measured."""
+"""Packages get accuracies that an adjustment can use; tables and maps keep the measured ones."""
 
 from __future__ import annotations
 

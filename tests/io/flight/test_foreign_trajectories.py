@@ -1,4 +1,4 @@
-"""The sample flight with its trajectory in other formats: the same places, with what they lose."""
+"""The sample flight with its trajectory in other formats: the same positions, up to rounding."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every fault of a file of marked places ends in one line that says what to do."""
+"""Every fault in a file of manual marks is a one-line error with a remedy."""
 
 from __future__ import annotations
 

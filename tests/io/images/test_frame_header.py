@@ -1,4 +1,4 @@
-"""What headers of frames say: size, maker, focal length, position and altitude."""
+"""Values from frame headers: size, maker, focal length, position and altitude."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The same out of Google's store and into it: an emulator of its protocol on this machine."""
+"""Frames from Google's object store and results into it, with a local emulator of its protocol."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames out of an object store, and results into it: a server of S3's protocol on this machine."""
+"""Frames from an object store and results into it, with a local server of S3's protocol."""
 
 from __future__ import annotations
 

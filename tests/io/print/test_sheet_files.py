@@ -1,4 +1,4 @@
-"""From print to detection: files as they are, rasterised, photographed and found."""
+"""Printed sheets: the files themselves, and detection after rasterising and photographing them."""
 
 from __future__ import annotations
 

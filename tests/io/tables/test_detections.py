@@ -1,4 +1,4 @@
-"""Rows of the detections, from records."""
+"""Rows of detections.parquet from measurement records."""
 
 from __future__ import annotations
 

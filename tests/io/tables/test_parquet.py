@@ -1,4 +1,4 @@
-"""Tables there and back, and what happens to those that cannot be."""
+"""Tables are read back as written; impossible and damaged ones are errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a fit must show before it is reported: code, residuals, precision."""
+"""Tests that a fit must pass before it is reported: code, residuals, precision."""
 
 from __future__ import annotations
 

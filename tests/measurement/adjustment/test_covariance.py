@@ -1,4 +1,4 @@
-"""From the covariance of a pose to what is reported, against samples of poses."""
+"""Covariance of a pose, and the reported deviations compared with samples of poses."""
 
 from __future__ import annotations
 

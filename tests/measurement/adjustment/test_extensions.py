@@ -1,4 +1,4 @@
-"""What the residuals of a fit ask for beyond the plain model, and when they ask for it."""
+"""When the residuals of a fit require an extension of the plain model, and which one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The image model on simulated frames: are errors what their deviations say, in all conditions?"""
+"""The image model on simulated frames: errors agree with their deviations in all conditions."""
 
 from __future__ import annotations
 
@@ -233,7 +233,7 @@ def test_a_base_whose_fit_is_refused_gives_way_to_the_other(
 def test_distances_under_a_clipped_film_curve_are_right_to_hundredths_of_a_percent(
     errors_of: Callable[..., Errors],
 ) -> None:
-    """Three shapes of a curve whose shoulder is cut off say less: two deviations too long."""
+    """A curve with a clipped shoulder is determined less well: two deviations too long."""
     camera = replace(LENS, response=Response.UNKNOWN)
     errors = errors_of(camera, 20.0, 6, sensor=FILM, gain=1.4)
     assert np.abs(errors.distance_percent).max() < 0.1

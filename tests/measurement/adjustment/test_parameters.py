@@ -1,4 +1,4 @@
-"""Steps of the adjustment: whatever they promise, a blur stays one that can be."""
+"""Steps of the adjustment never lead to an impossible blur."""
 
 from __future__ import annotations
 

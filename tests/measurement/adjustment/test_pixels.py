@@ -1,4 +1,4 @@
-"""Which pixels take part: plate only, of whatever shape the plate is."""
+"""Which pixels are used: those of the plate only, whatever its shape."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is flat on a plate: even light, a shadow's edge, and dots that are not light."""
+"""Light on the flat parts of a plate: even light, edges of shadows, and dots of another code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Residual maps: noise where the pose is right, a pattern where it is not."""
+"""Residual images: noise if the pose is right, a pattern if it is not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Smoothing along contours: seen in images that have it, and weighed by what all frames say."""
+"""Smoothing along contours: its estimate from one frame, and the combination of all frames."""
 
 from __future__ import annotations
 
@@ -112,6 +112,6 @@ def test_smoothing_of_single_frames_is_as_good_as_stated() -> None:
         seen = truth + rng.normal(0.0, sd)
         alike = [ContourSmoothing(*pair, np.zeros(6)) for pair in zip(seen, sd, strict=True)]
         learnt = camera_smoothing(alike)
-        told = np.array([learnt.in_measurement(each) for each in alike])
-        sigmas.append((told[:, 0] - truth) / told[:, 1])
+        combined = np.array([learnt.in_measurement(each) for each in alike])
+        sigmas.append((combined[:, 0] - truth) / combined[:, 1])
     assert 0.85 < np.sqrt(np.mean(np.square(sigmas))) < 1.15

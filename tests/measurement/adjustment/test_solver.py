@@ -1,4 +1,4 @@
-"""What an adjustment starts from, and when it takes its pixels for settled."""
+"""The start of an adjustment, and when its choice of pixels is final."""
 
 from __future__ import annotations
 

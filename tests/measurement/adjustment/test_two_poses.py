@@ -1,4 +1,4 @@
-"""From starts that lead astray."""
+"""Adjustments from starts that are tilted in a wrong direction."""
 
 from __future__ import annotations
 

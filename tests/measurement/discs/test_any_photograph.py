@@ -1,4 +1,4 @@
-"""Photographs that show no field: whatever is found and measured, nothing breaks."""
+"""Unusual and random photographs raise no exception and give finite results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all discs of a photograph say of the camera's tone curve and its sharpening."""
+"""The camera's tone curve and sharpening, learned from many discs of its photographs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""JPEG: its steps read from grey values, and what it hides of the tone curve of small discs."""
+"""JPEG: its quantisation steps from grey values, and tone curves learned despite compression."""
 
 from __future__ import annotations
 
@@ -254,7 +254,7 @@ def test_film_s_curve_is_learned_through_jpeg() -> None:
 
 @pytest.mark.parametrize("seed", [24, 28, 83])
 def test_film_s_curve_is_recognised_where_discs_contradict_each_other(seed: int) -> None:
-    """With these seeds, what discs say of the camera has 1.3 to 1.5 times the expected variance."""
+    """With these seeds, the excess of the discs' variance is 1.3 to 1.5."""
     tasks = tasks_of([compressed(photo, 92) for photo in small_discs(FILM, seed, 1)], 14)
     assert learn_tone(tasks, Response.UNKNOWN).tone is Tone.UNKNOWN
 

@@ -1,4 +1,4 @@
-"""Deviations of a disc alone: few arcs and few pixels, whose chance is not taken for roughness."""
+"""Deviations of single discs with few arcs and few pixels, and of all discs of a photograph."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Discs in photographs that are out of focus: a point becomes a disc, which is not a Gaussian."""
+"""Discs in photographs out of focus, whose point spread is a disc and no Gaussian."""
 
 from __future__ import annotations
 

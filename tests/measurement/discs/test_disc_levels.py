@@ -1,4 +1,4 @@
-"""Grey values of discs: the tone curve, and derivatives as differences show them."""
+"""Grey values of discs: the tone curve, and derivatives compared with differences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Discs of rendered fields: all are found, and measured as well as they say."""
+"""Discs of rendered fields: all are found, and measured as accurately as stated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Discs on textured ground: the texture as it was drawn, errors and deviations against truth."""
+"""Discs on textured ground: estimated texture, errors and deviations compared with the truth."""
 
 from __future__ import annotations
 

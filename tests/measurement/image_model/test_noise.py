@@ -1,4 +1,4 @@
-"""The likelihood: its derivatives, the noise it takes from residuals, and clipped pixels."""
+"""The likelihood: its derivatives, noise estimated from residuals, and clipped pixels."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def test_noise_of_ink_is_extrapolated_to_pure_ink(from_edges: str) -> None:
         noise = estimate_noise(residuals, share, usable, COUNT / 10.0, from_edges=True)
         found.append((noise.plateau_sd[:900] ** 2 / variance[:900]).mean())
     assert float(np.mean(found)) == pytest.approx(1.0, abs=0.02)
-    # by a tone curve, nothing says how much of that is plate's
+    # with a tone curve, the plate's share of it is not known
     noise = estimate_noise(
         residuals, share, usable, COUNT / 10.0, from_edges=True, is_linear_in_share=False
     )

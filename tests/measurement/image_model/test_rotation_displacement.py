@@ -1,4 +1,4 @@
-"""What rotations during the readout make of poses: small ones, large ones, and all on average."""
+"""Displacement of poses by rotations during the readout: single ones, and their mean square."""
 
 from __future__ import annotations
 

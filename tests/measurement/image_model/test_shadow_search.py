@@ -1,4 +1,4 @@
-"""Edges of shadows found in what is flat on a plate."""
+"""Edges of shadows found on the flat parts of a plate."""
 
 from __future__ import annotations
 

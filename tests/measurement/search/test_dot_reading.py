@@ -1,4 +1,4 @@
-"""Dots are read whatever the code is, and told by whose they are."""
+"""Dots of any code are read, and assigned to the ring that has this code."""
 
 from __future__ import annotations
 

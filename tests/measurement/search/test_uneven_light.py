@@ -1,4 +1,4 @@
-"""Polar patches of rings in uneven light: made even, and told from other codes."""
+"""Polar patches of rings in uneven light: correction of the light, and other codes."""
 
 from __future__ import annotations
 

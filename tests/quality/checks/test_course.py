@@ -26,7 +26,7 @@ def drive(
     origin = np.array([689586.0, 5336252.0, 500.0])
     xy = 150.0 * np.column_stack((np.cos(ANGLE), np.sin(ANGLE)))
     course = (-np.degrees(ANGLE)) % 360.0
-    # grid north is 1.9° from true north there, far less than what is told apart
+    # grid north is 1.9° from true north there, far less than the conventions differ by
     attitude = np.column_stack((0 * course + roll, 0 * course, turned(course)))
     position = origin + np.column_stack((xy, 0.0 * TIME_S))
     trajectory = Trajectory(TIME_S, position, attitude, None, None)

@@ -1,4 +1,4 @@
-"""Which layouts of targets are told as hard to find, and which sizes as those of other units."""
+"""Layouts that are reported as hard to find, and sizes that seem to be in other units."""
 
 from __future__ import annotations
 

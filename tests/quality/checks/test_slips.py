@@ -1,4 +1,4 @@
-"""The pieces of the search for causes that the corpus of wrong flights does not look at."""
+"""Parts of the search for causes that the tests with wrong flights do not cover."""
 
 from __future__ import annotations
 

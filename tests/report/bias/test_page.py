@@ -1,4 +1,4 @@
-"""The page in a browser: it says the same at any width, and points lead to their frames."""
+"""The page in a browser: the same content at any width, and links from points to frames."""
 
 from __future__ import annotations
 

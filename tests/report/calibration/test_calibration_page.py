@@ -1,4 +1,4 @@
-"""What the page says of a calibration by discs that face several ways, z towards the camera."""
+"""The page of a calibration with discs of several normals, and z towards the camera."""
 
 from __future__ import annotations
 
@@ -95,11 +95,11 @@ def test_heights_are_drawn_towards_the_camera_on_either_side(
 def test_a_good_fit_is_reported_with_what_it_does_not_determine(
     calibration: CameraCalibration,
 ) -> None:
-    told = fit_words(calibration)
+    words = fit_words(calibration)
     assert re.fullmatch(
         r"The RMS of the residuals is 0\.01\d px, the standard deviation of a measured disc"
         r" 0\.014 px; all parameters are determined\.",
-        told,
+        words,
     )
     weak = replace(calibration, undetermined=("k2",), tangled=("cx", "p1"))
     said = "k2 not determined by these photographs; cx, p1 cannot be separated."
@@ -107,7 +107,7 @@ def test_a_good_fit_is_reported_with_what_it_does_not_determine(
 
 
 @pytest.mark.parametrize(
-    ("points", "has_bar", "told"),
+    ("points", "has_bar", "words"),
     [
         (PointModel.STIFF, False, ""),
         (PointModel.STIFF, True, "The scale comes from the bars."),
@@ -120,8 +120,8 @@ def test_a_good_fit_is_reported_with_what_it_does_not_determine(
     ],
 )
 def test_the_source_of_the_field_s_scale_is_reported(
-    calibration: CameraCalibration, points: PointModel, *, has_bar: bool, told: str
+    calibration: CameraCalibration, points: PointModel, *, has_bar: bool, words: str
 ) -> None:
     bars = (FieldBar("p-30", "p-31", 0.05, 0.00001),) if has_bar else ()
     field = replace(calibration.field, bars=bars)
-    assert datum_words(replace(calibration, field=field, points_used=points)) == told
+    assert datum_words(replace(calibration, field=field, points_used=points)) == words

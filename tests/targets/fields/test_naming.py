@@ -106,10 +106,10 @@ def test_part_of_a_field_without_its_mark_is_not_guessed() -> None:
     assert name_discs(found, SQUARE) is NamingProblem.AMBIGUOUS
 
 
-@pytest.mark.parametrize(("radius_px", "is_told"), [(2.0, False), (2.7, True), (5.0, True)])
+@pytest.mark.parametrize(("radius_px", "is_named"), [(2.0, False), (2.7, True), (5.0, True)])
 def test_a_hole_too_small_to_be_seen_does_not_exclude_a_naming(
     radius_px: float,
-    is_told: bool,  # noqa: FBT001 - a parameter of the test
+    is_named: bool,  # noqa: FBT001 - a parameter of the test
 ) -> None:
     """All but the far corners are in view, and no mark looks hollow: turned, the mark is away."""
     found, truth = seen(SQUARE, 0.0, (0.0, 0.0), (0.0, 0.0))
@@ -122,7 +122,7 @@ def test_a_hole_too_small_to_be_seen_does_not_exclude_a_naming(
         np.zeros(int(is_kept.sum()), dtype=bool),
     )
     naming = name_discs(few, SQUARE)
-    if not is_told:
+    if not is_named:
         assert naming is NamingProblem.AMBIGUOUS
         return
     assert isinstance(naming, Naming)

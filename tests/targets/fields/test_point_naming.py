@@ -1,4 +1,4 @@
-"""Discs of fields without a lattice get their names from codes, or from how they lie."""
+"""Discs of fields without a lattice get their names from codes, or from their arrangement."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fields of points: what can be one, and what cannot."""
+"""Fields of points: valid and impossible ones."""
 
 from __future__ import annotations
 

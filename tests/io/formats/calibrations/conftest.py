@@ -33,7 +33,7 @@ def check() -> Callable[[Camera, Callable[[FloatArray], FloatArray]], None]:
 
 @pytest.fixture(scope="session")
 def brown() -> Callable[[FloatArray, tuple[float, ...], tuple[float, float]], FloatArray]:
-    """Return distorted coordinates by OpenCV's documentation, written out once more."""
+    """Return distorted coordinates by the formula of OpenCV's documentation."""
 
     def distort(points: FloatArray, k: tuple[float, ...], p: tuple[float, float]) -> FloatArray:
         x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]

@@ -1,4 +1,4 @@
-"""One camera, which files of several formats describe, and what its tests share."""
+"""One camera that files of several formats describe, and helpers of its tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all formats of calibrations share: recognition, sizes, names."""
+"""Common properties of all calibration formats: recognition, sizes, names."""
 
 from __future__ import annotations
 

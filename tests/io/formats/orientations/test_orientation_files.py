@@ -1,4 +1,4 @@
-"""What all formats of poses share: recognition, names, maps."""
+"""Common properties of all formats of poses: recognition, names, map coordinates."""
 
 from __future__ import annotations
 
