@@ -44,7 +44,7 @@ def test_a_table_of_selected_frames_is_accepted_for_the_flight(unmeasured: Sampl
     assert unmeasured.run("export-gcp").exit_code == 0
     frames = unmeasured.path / "frames"
     shutil.copy(frames / FRAMES[0], frames / "frame_0009.jpg")
-    assert unmeasured.run("export-gcp").exit_code == 0  # no pattern wants that one
+    assert unmeasured.run("export-gcp").exit_code == 0  # no pattern matches the new frame
     shutil.copy(frames / FRAMES[0], frames / "frame_0000b.jpg")
     assert "a new frame (frame_0000b.jpg)" in unmeasured.fails("export-gcp")
 

@@ -296,7 +296,7 @@ def test_bias_report_writes_table_figures_and_page(flight: FlightFolder) -> None
     assert numbers == {
         key: value for key, value in summary.items() if key not in {"files", "doubts"}
     }
-    assert numbers["verdict"] == "look"  # five frames say little
+    assert numbers["verdict"] == "look"  # five frames are too few
 
 
 def test_the_same_input_makes_the_same_bytes(flight: FlightFolder, tmp_path: Path) -> None:

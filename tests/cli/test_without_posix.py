@@ -53,7 +53,7 @@ def windows(tmp_path: Path) -> dict[str, str]:
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(AS_ON_WINDOWS, encoding="utf-8")
     paths = os.pathsep.join((str(tmp_path / "site"), str(ROOT)))
-    # the code page of a redirected output, and how Python treats what it lacks
+    # the code page of a redirected output, and Python's handling of missing characters
     return {**os.environ, "PYTHONPATH": paths, "PYTHONIOENCODING": "cp1252:surrogateescape"}
 
 

@@ -17,7 +17,7 @@ SEEDS = {
     for target in TARGETS
 }
 KEPT = sorted(path for kind in ("seeds", "found") for path in (FUZZ / kind).glob("*/*"))
-# What numbers and words are replaced by: what is of another type, too large, or ends something.
+# Replacements of numbers and words: of another type, too large, or terminators.
 VALUES = (
     *(b"", b"0", b"-1", b"nan", b"-inf", b"1e308", b"1e-308", b"1e999", b"9" * 30, b"9" * 5000),
     *(b"0x" + b"f" * 5000, b"true", b"null", b"2026-06-16", b"0001-01-01T00:00:00+23:59"),

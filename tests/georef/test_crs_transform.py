@@ -59,8 +59,11 @@ def test_longitude_comes_first_and_agrees_with_kruegers_series() -> None:
 @pytest.mark.parametrize(
     ("crs", "xyz"),
     [
-        ("EPSG:31467", (3_513_000.0, 5_403_000.0, 300.0)),  # says northing first, in metres
-        ("EPSG:4326", (9.2, 48.8, 300.0)),  # says latitude first
+        (
+            "EPSG:31467",
+            (3_513_000.0, 5_403_000.0, 300.0),
+        ),  # northing comes first in EPSG, in metres
+        ("EPSG:4326", (9.2, 48.8, 300.0)),  # latitude comes first in EPSG
         ("EPSG:2263", (987_000.0, 200_000.0, 10.0)),  # easting first, in feet
     ],
 )

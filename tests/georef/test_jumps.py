@@ -27,7 +27,7 @@ def test_false_flags_are_rare_whatever_the_stated_deviation() -> None:
 def test_a_turbulent_flight_has_no_jumps() -> None:
     rng = np.random.default_rng(9)
     time_s = 1.5 * np.arange(300.0)
-    gusty = 60.0 + 3.0 * rng.standard_normal(300)  # metres, where the deviations say centimetres
+    gusty = 60.0 + 3.0 * rng.standard_normal(300)  # metres, with deviations of centimetres
     assert not find_jumps(time_s, gusty, np.full(300, 0.02)).any()
 
 

@@ -83,6 +83,6 @@ def test_velocity_and_rotation_of_a_camera_follow_from_its_poses() -> None:
             assert not motions.is_observed[row]
             assert not motions.velocity_m_s[row].any()
             assert motions.sd_velocity_m_s[row] == pytest.approx(25.0 * turns[row].sd_rad_s)
-        if place == 0:  # the camera turns the other way than the scene
+        if place == 0:  # the camera rotates opposite to the scene
             turn = -enu_from_camera[0] @ rate.velocity_rad_s
             assert motions.turn_rad_s[row] == pytest.approx(turn)

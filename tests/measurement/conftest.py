@@ -135,7 +135,7 @@ def _on_plate(camera: Camera, pose: Pose, pixels: FloatArray) -> FloatArray:
 
 @pytest.fixture(scope="session")
 def imaging_of() -> Callable[..., FitProblem]:
-    """What the adjustment of a drawn or photographed target starts from."""
+    """The start of the adjustment of a drawn or photographed target."""
 
     def collect(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> FitProblem:
         radius_m = 0.5 * target.ring.outer_diameter_m

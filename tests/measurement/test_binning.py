@@ -120,7 +120,7 @@ def half_in_shade(response: Response, turn: float, rng: np.random.Generator) -> 
 def test_large_rings_half_in_shade_are_measured_as_well_as_in_even_light(
     response: Response,
 ) -> None:
-    """In linear light by bins; by bins of sRGB's curve deviations would be 0.013 to 0.019 %."""
+    """Bins are used for linear light; under sRGB's curve, they would have 0.013 to 0.019 %."""
     rng = np.random.default_rng(11)
     for turn in (0.4, 2.1, 3.9):
         shot = half_in_shade(response, turn, rng)
@@ -133,7 +133,7 @@ def test_large_rings_half_in_shade_are_measured_as_well_as_in_even_light(
 
 
 def test_compression_of_large_rings_is_not_taken_for_uneven_light() -> None:
-    """Bins in which levels vary have deviations of 0.004 to 0.011 % there."""
+    """Bins with varying levels would have deviations of 0.004 to 0.011 %."""
     rng = np.random.default_rng(8)
     for _ in range(4):
         shot = shoot(Response.UNKNOWN, 1.1, rng)

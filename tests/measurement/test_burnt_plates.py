@@ -38,7 +38,7 @@ def test_compressed_burnt_plates_are_measured_as_well_as_others(
     radius_px: float,
     percent: float,
 ) -> None:
-    """Taken for exact, the grey values beside clipped ones put these rings off by up to 0.4 %."""
+    """If grey values beside clipped ones count as exact, these rings are off by up to 0.4 %."""
     camera, sensor, standardised = replace(LENS, response=response), Sensor(tone=tone), []
     for seed in range(3):
         rng = np.random.default_rng(40 + seed)
@@ -89,7 +89,7 @@ def test_the_edge_shift_follows_the_light_on_each_edge(
     response: Response,
     tone: ToneCurve,
 ) -> None:
-    """By the white that is seen, 1, none of them would seem displaced."""
+    """Computed from the visible white, 1, none of the edges would seem displaced."""
     shifts_px = []
     for edge_m in (0.7, 0.44, 0.0):  # none in shade, hardly any, half of them
         _, seen = half_in_shade(photograph, start_near, response, tone, edge_m)

@@ -97,7 +97,7 @@ def test_overexposure_shows_as_an_edge_shift_and_as_clipped_pixels(
 def test_sixteen_bits_measure_like_eight(
     target: Target, camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame, bits: int
 ) -> None:
-    """They often hold fewer, which are not moved to the end of the range."""
+    """Files of 16 bits often hold fewer, which are not scaled to the full range."""
     pose = place_plate((240.0, 180.0), 25.0, tilt_deg=10.0)
     share = (2.0**bits - 1.0) / 65535.0
     shallow, deep = (

@@ -143,7 +143,7 @@ def test_the_shadow_of_a_mast_costs_little(
 def test_a_broad_shadow_is_refused_or_covered_by_the_deviations(
     measure: Callable[..., list[Outcome]],
 ) -> None:
-    """Where it lies along an edge of the ring, up to seven deviations and 0.7 % have been seen."""
+    """A shadow along an edge of the ring has caused errors of up to seven deviations and 0.7 %."""
     check(measure(TARGET_PLATE, (0.75, 0.3)), sigmas=8.0, percent=1.5)
 
 
@@ -183,7 +183,7 @@ def test_a_hidden_quarter_is_refused_or_covered_by_the_deviations(
 def test_a_target_with_a_hidden_quarter_is_found_and_measured(
     photograph: Photograph, angle_deg: float, radiance: float
 ) -> None:
-    """The search sees what is hidden; black, grey or white, and dots with it."""
+    """The search recognises the hidden part, be it black, grey or white, with its dots."""
     rng = np.random.default_rng(7)
     pose = some_pose(rng)
     quarter_m = 0.9 * math.sin(math.radians(21.0))

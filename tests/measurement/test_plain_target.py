@@ -55,7 +55,7 @@ def frame_with(*placed: tuple[PlainTarget, Pose], seed: int = 1) -> GreyArray:
 def prediction_of(
     pose: Pose, off_px: tuple[float, float] = (0.0, 0.0), size: float = 1.0
 ) -> PlainPrediction:
-    """A prediction that is good to 3 px, and as wrong as that."""
+    """A prediction with a deviation of 3 px and an error of this size."""
     centre_px = CAMERA.project(pose.translation_m[None])[0] + off_px
     return PlainPrediction(
         centre_px,
@@ -93,7 +93,7 @@ def test_the_centre_is_right_within_its_deviations(target: PlainTarget) -> None:
 
 @pytest.mark.parametrize("target", [DISC, RING], ids=["disc", "ring"])
 def test_without_a_border_deviations_cover_the_texture_of_the_ground(target: PlainTarget) -> None:
-    """On the same grass, a border that is not there would be taken for even ground."""
+    """On the same grass, a wrongly stated border would make the ground count as even."""
     bare, rng = replace(target, border_m=None), np.random.default_rng(4)
     grass = cv2.GaussianBlur(rng.standard_normal((CAMERA.height, CAMERA.width)), (0, 0), 1.0)
     off_px, sd_px = [], []
@@ -142,7 +142,7 @@ def test_a_far_ring_is_measured_as_a_whole() -> None:
 def test_an_unknown_tone_curve_does_not_change_the_size_of_a_far_ring(
     radius_px: float, least: float, most: float
 ) -> None:
-    """Its two edges tell how far ink spreads; 1.5 px apart they do not, and it counts in full."""
+    """Its two edges determine the spread of the ink, unless they are only 1.5 px apart."""
     target = replace(RING, border_m=0.9)
     near = pose_at(90.4, 71.7, RING).translation_m
     pose = pose_towards(RADIUS_PX / radius_px * near, NORMAL)
@@ -192,7 +192,7 @@ def pose_tilted(pose: Pose) -> Pose:
 @pytest.mark.parametrize("tilt_deg", [0.0, 20.0, 40.0, 55.0])
 @pytest.mark.parametrize("target", [DISC, RING], ids=["disc", "ring"])
 def test_a_free_normal_allows_two_centres(target: PlainTarget, tilt_deg: float) -> None:
-    """The place is their mean: it is off by half of what they differ by, and says so.
+    """The reported centre is their mean, whose deviation covers half of their difference.
 
     Circles that are each measured by themselves tell which of the two it is.
     """
@@ -309,7 +309,7 @@ def test_the_smallest_disc_needs_even_ground_and_a_normal(
 @pytest.mark.parametrize("tilt_deg", [0.0, 50.0])
 @pytest.mark.parametrize("share", [0.3, 0.42, 0.58, 0.9])
 def test_a_smooth_blob_is_refused(share: float, tilt_deg: float) -> None:
-    """Spread by so much of the smaller semi-axis, which a tilt shortens: half is the limit."""
+    """The limit of the spread is half the smaller semi-axis, which a tilt shortens."""
     radius_px, tilt_rad = 4.5, math.radians(tilt_deg)
     along = RADIUS_PX / radius_px * pose_at(90.0, 70.0).translation_m
     toward = along / np.linalg.norm(along)
@@ -344,7 +344,7 @@ def test_the_fit_recovers_the_projected_circles() -> None:
 
 @pytest.mark.parametrize("sd_deg", [0.3, 3.0])
 def test_unknown_normal_widens_the_centre(sd_deg: float) -> None:
-    """(R²/f) σ: by so much a turn displaces the centre against the ellipse, seen squarely."""
+    """By (R²/f) σ, the displacement of the centre relative to the ellipse, seen from the front."""
     along = pose_at(100.0, 80.0).translation_m
     normal = along / np.linalg.norm(along)
     pose, radii = pose_towards(along, normal), np.array(DISC.radii_m)
@@ -380,7 +380,7 @@ def read_row_by_row(pose: Pose, radius_m: float, rate_rad_s: FloatArray) -> Floa
 
 @pytest.mark.parametrize("target", [DISC, RING], ids=["disc", "ring"])
 def test_deviations_cover_unknown_motion_under_a_rolling_shutter(target: PlainTarget) -> None:
-    """Forty of R 20 px: twice as near as others here."""
+    """Forty images of R 20 px, twice as near as in other tests."""
     rng, radii = np.random.default_rng(6), np.array(target.radii_m)
     cov = 1e-5 * np.diag([1.0, 1.0, 100.0, 100.0, 100.0])
     off: dict[Camera, list[float]] = {ROLLING: [], CAMERA: []}

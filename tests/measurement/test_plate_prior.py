@@ -105,7 +105,7 @@ def test_a_confirmed_choice_keeps_every_value() -> None:
 
 
 def test_confirming_a_pose_removes_the_covariance_of_the_other_pose() -> None:
-    """The chance that it is the right one, times the square of how far it is off."""
+    """The covariance of the other pose is its probability times its squared difference."""
     _, grey, before = frame(0)
     after = measure(grey, NormalPrior(before.pose.normal, SD_DEG))
     assert before.uncertainty is not None

@@ -42,7 +42,7 @@ POSES = [
 
 
 def solve_again(camera: Camera, pose: Pose) -> Pose:
-    """The pose that another camera makes of the image that CAMERA took; its normal and centre."""
+    """Normal and centre of the pose that another camera gives for the image taken by CAMERA."""
     angles = np.linspace(0.0, 2.0 * np.pi, 180, endpoint=False)
     circle = RADIUS_M * np.column_stack((np.cos(angles), np.sin(angles)))
     seen = camera.undistort(CAMERA.project(pose.transform(circle)))
@@ -70,7 +70,7 @@ def test_derivatives_of_the_pose_by_every_parameter_are_right(name: str, pose: P
     column = CALIBRATION_PARAMETERS.index(name)
     follows = pose_by_calibration(CAMERA, RADIUS_M, pose)[:, column]
     by_centre, by_normal = changes(name, pose)
-    # What moves nothing by a hundredth of what a pixel would is compared with that.
+    # Changes below a hundredth of a pixel's effect are compared with that limit.
     least = 1e-2 * pose.distance_m / CAMERA.fx / STEPS[name]
     assert np.allclose(follows[:3], by_centre, rtol=0.01, atol=0.01 * least)
     turned = np.cross(follows[3:], pose.normal)

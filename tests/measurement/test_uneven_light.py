@@ -101,7 +101,7 @@ def test_distances_in_uneven_light_are_as_accurate_as_stated(
 def test_a_frame_turned_upside_down_gives_the_same_result(
     photograph: Photograph, start_near: StartNear, lights: Lights
 ) -> None:
-    """Knots that hung on the window's corner made differences of 0.5 to 1.1 σ (RMS)."""
+    """When knots began at the window's corner, results differed by 0.5 to 1.1 σ (RMS)."""
     turned = replace(LENS, cx=LENS.width - 1.0 - LENS.cx, cy=LENS.height - 1.0 - LENS.cy)
     half_turn, off = np.diag([-1.0, -1.0, 1.0]), []
     for seed in range(4):
@@ -130,7 +130,7 @@ def test_a_frame_turned_upside_down_gives_the_same_result(
 def test_an_antenna_s_sharp_shadow_is_modelled_by_its_edges(
     photograph: Photograph, start_near: StartNear, gain: float
 ) -> None:
-    """Levels on grids are smooth: with them alone rings are up to 0.1 % off, burnt ones 0.36 %."""
+    """With smooth levels on grids only, rings are up to 0.1 % off, and burnt ones 0.36 %."""
     errors, sigmas = [], []
     for seed in range(6):
         rng = np.random.default_rng(900 + seed)
@@ -152,7 +152,7 @@ def test_an_antenna_s_sharp_shadow_is_modelled_by_its_edges(
 def test_small_rings_in_uneven_light_are_as_accurate_as_stated(
     photograph: Photograph, start_near: StartNear, lights: Lights, percent: float
 ) -> None:
-    """Taken for even, shades and highlights put rings of 9 px off by 1 to 6 %, or 3 to 15 σ."""
+    """Without varying levels, rings of 9 px are off by 1 to 6 %, or 3 to 15 σ."""
     errors, sigmas = [], []
     for seed in range(6):
         rng = np.random.default_rng(700 + seed)
@@ -173,7 +173,7 @@ def test_small_rings_in_uneven_light_are_as_accurate_as_stated(
 def test_dirt_under_an_unknown_film_curve_does_not_change_the_size(
     photograph: Photograph, start_near: StartNear
 ) -> None:
-    """A light that the plain fit curved stayed so beneath varying levels: errors of 2 to 4 σ."""
+    """When the curvature of the plain fit was kept beneath the levels, errors were 2 to 4 σ."""
     camera, film = replace(LENS, response=Response.UNKNOWN), Sensor(tone=ToneCurve.FILM)
     sigmas = []
     for seed in range(5):
@@ -188,7 +188,7 @@ def test_dirt_under_an_unknown_film_curve_does_not_change_the_size(
 
 @pytest.fixture
 def fits(monkeypatch: pytest.MonkeyPatch) -> list[TargetFit]:
-    """The fits whose covariance a test's measurements ask for, as they come."""
+    """The fits of a test's measurements, recorded when their covariance is computed."""
     kept: list[TargetFit] = []
 
     def keep(fit: TargetFit) -> PoseCovariance:
@@ -230,7 +230,7 @@ def test_fits_with_levels_do_not_depend_on_their_start(
 def test_both_bases_of_the_tone_curve_see_the_same_pixels_under_a_highlight(
     photograph: Photograph, start_near: StartNear, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Otherwise their likelihoods do not compare.
+    """Otherwise their likelihoods could not be compared.
 
     With the first fit's pose, but with the levels that are seen, up to a third of the pixels looked
     foreign to the second base.
@@ -262,7 +262,7 @@ def phone_photograph(
     field: PlateLight | None = None,
     gain: float = 0.8,
 ) -> GreyArray:
-    """A phone's picture of a plate between dark and bright ground, which change its levels."""
+    """A phone's photograph of a plate between dark and bright ground, which affect its levels."""
     sensor = Sensor(tone=ToneCurve.SRGB, sharpening=0.8, sharpening_px=1.2)
     irradiance = np.full((LENS.height, LENS.width), 0.03)
     irradiance[:, LENS.width // 2 :] = 0.9
@@ -321,7 +321,7 @@ def test_burnt_white_that_a_phone_darkened_counts_as_clipped(
 def test_the_edge_shift_beside_burnt_white_uses_the_visible_white(
     start_near: StartNear,
 ) -> None:
-    """By the limit above which all counts as clipped, it would be 0.7 px."""
+    """Computed from the limit above which values count as clipped, it would be 0.7 px."""
     camera, rng = replace(LENS, response=Response.UNKNOWN), np.random.default_rng(31)
     pose, gain = some_pose(rng, 110.0), 1.5
     grey = phone_photograph(pose, rng, Phone(), gain=gain)
@@ -348,7 +348,7 @@ def test_the_edge_shift_beside_burnt_white_uses_the_visible_white(
 def test_the_centre_is_less_certain_if_processing_hides_a_skew(
     start_near: StartNear,
 ) -> None:
-    """With no more of the skew's displacement than elsewhere, z of these centres was 2.0."""
+    """With the usual share of the skew's displacement, z of these centres was 2.0."""
     camera, squares = replace(LENS, response=Response.UNKNOWN), []
     phone = Phone(bilateral=0.3)
     for seed in range(6):
@@ -456,7 +456,7 @@ def test_only_poorly_explained_light_is_fitted_from_another_start(
 
 
 def resting_at(pose: Pose) -> Callable[..., TargetFit]:
-    """Return a fit of levels that comes to rest at a pose, whatever its start."""
+    """Return a stand-in for the fit of levels that always ends at the same pose."""
 
     def fit(problem: FitProblem, starts: list[Parameters], unknowns: Unknowns) -> TargetFit:
         (start,) = starts
@@ -520,7 +520,7 @@ def test_distances_out_of_focus_are_as_accurate_as_stated(
     tone: ToneCurve,
     most_percent: float,
 ) -> None:
-    """Taken for a Gaussian, the spread made them 0.04 and 0.19 % too short, and 0.05 % too long."""
+    """With a Gaussian spread, they were 0.04 and 0.19 % too short, and 0.05 % too long."""
     percent, sigmas = errors_out_of_focus(photograph, start_near, radius_px, tone, lambda _: None)
     assert abs(percent.mean()) < most_percent
     assert 0.2 < math.sqrt(np.mean(sigmas**2)) < 1.5
@@ -541,7 +541,7 @@ def test_defocus_is_recognised_under_a_shadow(
 def test_even_light_gives_the_result_of_the_plain_model(
     photograph: Photograph, start_near: StartNear, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The plain model's result is the result, to the last bit."""
+    """The result equals that of the plain model to the last bit."""
     rng = np.random.default_rng(11)
     pose = some_pose(rng)
     grey, start = photograph(LENS, pose, rng), start_near(LENS, pose, rng)
@@ -662,7 +662,7 @@ def test_the_fitted_light_can_be_shown(photograph: Photograph) -> None:
 def test_residuals_of_a_large_plate_in_shade_are_those_of_single_pixels(
     photograph: Photograph,
 ) -> None:
-    """Bins, which hide a tone curve, left twice as much at its edges."""
+    """Residuals of bins, which hide a tone curve, were twice as large at the edges."""
     camera, rng = replace(LENS, response=Response.UNKNOWN), np.random.default_rng(77)
     pose = some_pose(rng, 152.0)
     sensor = Sensor(tone=ToneCurve.SRGB)

@@ -96,7 +96,7 @@ def test_wrong_discs_are_rejected_whole(rng: np.random.Generator) -> None:
 
 
 def test_the_shape_of_a_free_field_is_estimated(rng: np.random.Generator) -> None:
-    """Known up to shift, turn and scale: what it has in common with the nominal one is kept."""
+    """It is determined up to shift, rotation and scale, which are those of the nominal field."""
     bend = np.zeros((35, 3))
     bend[:, 2] = 0.0005 * rng.standard_normal(35)
     nominal = simulated().network.points.nominal
@@ -123,7 +123,7 @@ def test_a_bar_gives_a_free_field_its_scale(rng: np.random.Generator) -> None:
 def test_a_bar_gives_a_stiff_field_its_scale_and_the_nominal_one_does_not(
     rng: np.random.Generator,
 ) -> None:
-    """The ends of the bar are off, too: a nominal scale would pull it away from its length."""
+    """The nominal places of the bar's ends are wrong; a nominal scale would change its length."""
     nominal = simulated().network.points.nominal
     printed = 1.02 * (nominal + 0.00005 * rng.standard_normal(nominal.shape))
     length = float(np.linalg.norm(printed[34] - printed[0]))
@@ -157,7 +157,7 @@ def test_a_stiff_field_bends_no_further_than_its_prior_allows(rng: np.random.Gen
 def test_clustered_deviations_contain_errors_common_to_a_photograph(
     rng: np.random.Generator,
 ) -> None:
-    """Each photograph with a lens of its own: the formal deviations do not know it."""
+    """Each photograph has its own lens errors, which formal deviations do not contain."""
     made = simulated(16)
     ratios = []
     for _ in range(12):
@@ -183,7 +183,7 @@ def test_clustered_deviations_contain_errors_common_to_a_photograph(
 def test_few_places_with_independent_errors_hardly_enlarge_deviations(
     rng: np.random.Generator, places: int, parameters: int
 ) -> None:
-    """Chance makes an excess of 0.3 to 0.5 of the variances, were only what is below 0 cut off."""
+    """If only negative excesses were cut off, chance would add 0.3 to 0.5 of the variances."""
     expected = np.tile(np.eye(parameters) / places, (places, 1, 1))
     pulls = rng.standard_normal((200, places, parameters)) / np.sqrt(places)
     excess = [np.trace(excess_scatter(each, expected)) / parameters for each in pulls]
@@ -196,7 +196,7 @@ def test_few_places_with_independent_errors_hardly_enlarge_deviations(
 
 
 def test_covariances_are_scaled_to_the_residuals(rng: np.random.Generator) -> None:
-    """Residuals that are too small scale them; what is too much is the same for all discs."""
+    """Small residuals reduce them in proportion; an excess is added equally to all discs."""
     noisy = simulated().observed(rng)
     solution = adjust_network(noisy.network, noisy.truth)
     own = noisy.network.observations.cov
@@ -208,7 +208,7 @@ def test_covariances_are_scaled_to_the_residuals(rng: np.random.Generator) -> No
 
 
 def test_inseparable_parameters_are_named() -> None:
-    """Seen square on only, distance and focal length look the same; so do shift and centre."""
+    """Frontal views separate neither distance and focal length nor shift and principal point."""
     assert tangled(("a", "b", "c"), np.diag([1.0, 4.0, 9.0]), 100.0) == ()
     alike = np.array([[1.0, 0.9999, 0.0], [0.9999, 1.0, 0.0], [0.0, 0.0, 1.0]])
     assert tangled(("a", "b", "c"), alike, 100.0) == ("a", "b")
@@ -233,7 +233,7 @@ def test_a_published_adjustment_is_reproduced() -> None:
 
 
 def test_points_may_be_eliminated_instead_of_poses(rng: np.random.Generator) -> None:
-    """Both ways lead to the same step, and to the same share of the priors."""
+    """Both eliminations give the same step and the same share of the priors."""
     bend = 0.0002 * rng.standard_normal((35, 3))
     nominal = simulated().network.points.nominal
     information = np.broadcast_to(np.diag([1.0, 2.0, 0.5]) / 0.0002**2, (35, 3, 3))
@@ -258,7 +258,7 @@ def test_points_may_be_eliminated_instead_of_poses(rng: np.random.Generator) -> 
 
 
 def test_variances_that_rounding_makes_negative_count_as_undetermined() -> None:
-    """Straight views of a field of 80 discs leave −0.005 of the focal length: 1e-10 of it."""
+    """Frontal views of 80 discs leave −0.005 of the focal length's element, 1e-10 of it."""
     assert scales_of(np.diag([4.0, 0.25])).tolist() == [0.5, 2.0]
     with pytest.raises(np.linalg.LinAlgError):
         scales_of(np.diag([-0.005, 700.0]))

@@ -21,7 +21,7 @@ AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 def with_own_lenses(made: SimulatedNetwork, rng: np.random.Generator) -> SimulatedNetwork:
-    """Return noisy photographs, each place with a lens of its own: what the model lacks."""
+    """Return noisy photographs, with lens errors for each place that the model does not contain."""
     noisy = made.observed(rng)
     observed = noisy.network.observations
     stretch = 1.0 + 2e-4 * rng.standard_normal((PLACES, 2))
@@ -31,14 +31,14 @@ def with_own_lenses(made: SimulatedNetwork, rng: np.random.Generator) -> Simulat
 
 
 def adjusted(made: SimulatedNetwork) -> tuple[FloatArray, Precision]:
-    """Return the errors (p,) of the camera, and how well it is stated to be known."""
+    """Return the errors (p,) of the camera, and the calibration with its deviations."""
     solution = adjust_network(made.network, made.truth)
     error = (solution.estimate.cameras - made.truth.cameras)[0]
     return error, precision(made.network, solution)
 
 
 def moved(truth: Estimate, view: int, turn: FloatArray, shift_m: FloatArray) -> Estimate:
-    """Return the poses with one camera turned about its projection centre, then shifted."""
+    """Return the poses with one camera rotated about its projection centre, then shifted."""
     rotations, translations = truth.rotations.copy(), truth.translations.copy()
     rotations[view] = rotation_about(turn) @ rotations[view]
     translations[view] = rotation_about(turn) @ translations[view] - shift_m
@@ -46,7 +46,7 @@ def moved(truth: Estimate, view: int, turn: FloatArray, shift_m: FloatArray) -> 
 
 
 def test_deviations_of_a_burst_cover_its_errors(rng: np.random.Generator) -> None:
-    """Four photographs of each place have the lens of the place, and each its own noise."""
+    """Four photographs of a place share its lens errors and have independent noise."""
     once, burst = simulated(PLACES), repeated(simulated(PLACES), TIMES)
     ratios, gains = [], []
     for _ in range(16):
@@ -71,7 +71,9 @@ def test_a_photograph_repeated_four_times_counts_once(
     assert single.places.tolist() == list(range(PLACES))
     assert fourfold.places.tolist() == TIMES * list(range(PLACES))
     sd, same = (np.sqrt(known.camera_cov.diagonal()[:3]) for known in (single, fourfold))
-    assert same == pytest.approx(sd, rel=0.05)  # not the distortion, whose formal one is larger
+    assert same == pytest.approx(
+        sd, rel=0.05
+    )  # not of the distortion, whose formal deviation is larger
 
 
 @pytest.mark.parametrize("axis", AXES)

@@ -42,7 +42,7 @@ SD_PX = 0.02
 def images(
     field: AnyField, pose: CameraPose, rng: np.random.Generator, beyond_px: float = 0.0
 ) -> tuple[IndexArray, FloatArray, FloatArray]:
-    """Moments of all discs, with noise, and more noise than their covariances tell of."""
+    """Moments of all discs, with noise, which may exceed their covariances."""
     focal = pose.focal_scale
     camera = replace(CAMERA, fx=focal * CAMERA.fx, fy=focal * CAMERA.fy)
     camera = replace(camera, k1=CAMERA.k1 * focal**2)  # the lens is that of the image

@@ -76,7 +76,7 @@ def test_individual_and_common_errors_of_prints_scatter_as_stated(
 
 @pytest.mark.parametrize("wrong", [0.8, 1.25])
 def test_diameters_off_by_half_are_reported_even_with_an_unknown_focal_length(wrong: float) -> None:
-    """Positions and images tell the focal length; distances were measured by a wrong one."""
+    """Positions and images determine the focal length; distances were measured with a wrong one."""
     camera = replace(CAMERA, fx=wrong * CAMERA.fx, fy=wrong * CAMERA.fy, k1=wrong**2 * CAMERA.k1)
     places_m = np.array([[-4, -3, 0], [4, -3, 2.5], [4, 3, -2], [-4, 3, 2], [0, 1, -1.5]], float)
     seen = POSE.in_camera(places_m)
@@ -116,7 +116,7 @@ def test_a_print_accuracy_in_sightings_and_flight_counts_once() -> None:
 def test_a_single_ring_uses_the_larger_of_both_stated_deviations(
     sd_scale: float, sd_common: float
 ) -> None:
-    """What its sighting and the flight state of the same print counts once."""
+    """The accuracy of a print counts once, even if sighting and flight both state it."""
     flight = GroundFlight(frames=5)
     sd = max(sd_scale, sd_common)
     sightings = []
@@ -163,7 +163,7 @@ def test_a_single_ring_uses_the_larger_of_both_stated_deviations(
 def test_a_single_ring_has_the_position_errors_common_to_all_frames(
     frames: int, flights: int
 ) -> None:
-    """More frames do not tell better how its plate lies, if the other targets are misplaced."""
+    """More frames do not reduce the error of its position due to other misplaced targets."""
     rng, z = np.random.default_rng(9), []
     for seed in range(flights):
         flight = GroundFlight(frames=frames, seed=seed)

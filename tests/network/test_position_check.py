@@ -18,7 +18,7 @@ SD_PX, SD_DISTANCE = 0.005, 2e-4
 def checked(
     targets: int, seed: int, *, off_m: float = 0.0, sd_m: float = 0.01, noise: float = 1.0
 ) -> tuple[str, WrongPosition | None]:
-    """The target whose height is wrong, and what is found of it; noise in stated deviations."""
+    """The target with a wrong height, and the result of the check; noise in stated deviations."""
     rng = np.random.default_rng(seed)
     names = tuple("ABCDEF"[:targets])
     offsets_m = rng.uniform(-4.0, 4.0, (targets, 3)) * [1.0, 1.0, 0.2]
@@ -61,7 +61,7 @@ def checked(
 def test_the_wrong_position_is_named_among_few_others(
     targets: int, named: tuple[float, float]
 ) -> None:
-    """Four targets hardly tell which of them is wrong, six do."""
+    """Four targets hardly show which of them is wrong, six do."""
     found = [checked(targets, seed, off_m=0.1) for seed in range(40)]
     found_wrong = [(true, wrong) for true, wrong in found if wrong is not None]
     assert len(found_wrong) >= 28
@@ -74,7 +74,7 @@ def test_the_wrong_position_is_named_among_few_others(
 @pytest.mark.parametrize("sd_m", [0.0003, 0.01])
 @pytest.mark.parametrize("noise", [0.1, 1.0, 10.0])
 def test_image_noise_other_than_stated_contradicts_no_position(sd_m: float, noise: float) -> None:
-    """What no positions explain widens the images' covariances."""
+    """Residuals that no position explains enlarge the covariances of the images."""
     found = [checked(6, seed, sd_m=sd_m, noise=noise)[1] for seed in range(12)]
     assert found == [None] * 12
 

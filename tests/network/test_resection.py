@@ -89,7 +89,7 @@ def test_a_common_scale_of_distances_is_found_beside_a_wrong_name() -> None:
     assert found.distance_scale == pytest.approx(np.log(1.004), abs=2e-4)
     off = found.pose.centre_m - POSE.centre_m
     z = off / np.sqrt(found.cov.diagonal()[:3])
-    assert np.abs(z).max() < 0.5  # what is allowed for draws it a little towards none
+    assert np.abs(z).max() < 0.5  # the prior draws the scale slightly towards 0
     known = orient(CAMERA, replace(images, distances_m=distances_m / 1.004))
     assert np.linalg.norm(known.pose.centre_m - POSE.centre_m) < 1e-6
     assert known.distance_scale == 0.0
@@ -143,7 +143,7 @@ def test_the_limit_of_chi2_is_stricter_with_few_redundant_observations(
 
 
 def test_deviations_are_right_for_points_nearly_in_a_line() -> None:
-    """A turn about the line that is good to some degrees moves the camera along an arc."""
+    """The rotation about the line is known to some degrees, which moves the camera along an arc."""
     rng = np.random.default_rng(8)
     squares = []
     for _ in range(60):

@@ -164,7 +164,7 @@ def test_the_camera_s_rates_make_poses_more_certain() -> None:
 
 @pytest.mark.parametrize("shift_sd_m_s", [0.0, 29.0 * SD_RAD_S])
 def test_a_single_ring_is_exposed_at_its_own_row(shift_sd_m_s: float) -> None:
-    """Its pose is brought to the middle row, if the camera's rates tell all of the motion."""
+    """Its pose is converted to the middle row if the camera's rates are known."""
     rng, z = np.random.default_rng(7), []
     for seed in range(12):
         flight = GroundFlight(NAMES[:4], OFFSETS_M[:4], frames=4, seed=seed)

@@ -77,7 +77,7 @@ def test_points_may_be_eliminated_instead_of_poses_and_bends(rng: np.random.Gene
 def test_bends_and_camera_are_as_accurate_as_stated(
     rng: np.random.Generator,
 ) -> None:
-    """A sheet that is taken for rigid costs the camera ten times its accuracy."""
+    """If the sheet is assumed to be rigid, errors of the camera are ten times as large."""
     errors, rigid_errors, found = [], [], []
     for _ in range(6):
         made = bent(rng)
@@ -99,7 +99,7 @@ def test_bends_and_camera_are_as_accurate_as_stated(
         errors.append(off / np.sqrt(known.camera_cov.diagonal()))
         rigid_errors.append((alone.estimate.cameras[0] - made.truth.cameras[0]) / off)
         gaps = solution.estimate.bends - made.truth.bends
-        gaps -= gaps.mean(axis=0)  # what all have in common is the field's own shape
+        gaps -= gaps.mean(axis=0)  # the common part belongs to the field's own shape
         sd = np.sqrt(known.variance_factor * bend_cofactors(network, solution))
         assert np.sqrt(np.mean(gaps**2)) < 0.3 * BEND_M
         assert np.sqrt(np.mean((gaps / sd) ** 2)) < 1.4

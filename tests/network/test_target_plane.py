@@ -207,7 +207,7 @@ def test_circles_that_were_not_moved_show_no_move(frames: int) -> None:
 
 
 def test_drifting_poses_are_not_taken_for_a_moved_circle() -> None:
-    """Errors of poses that follow each other displace all circles of a frame alike."""
+    """Correlated errors of poses displace all circles of a frame alike."""
     rng, truth = np.random.default_rng(14), circle_of(10.0)
     many = [views_of(truth, rng, frames=16) for _ in range(5)]
     drift = np.where(np.arange(16) < 8, 0.0, 0.1)
@@ -220,7 +220,7 @@ def test_drifting_poses_are_not_taken_for_a_moved_circle() -> None:
 
 
 def test_a_bad_outline_among_good_ones_has_its_own_larger_deviations() -> None:
-    """Its places are as good as theirs, and its shapes are forty times as bad as stated."""
+    """Its centres are as good as the others', but its shapes are forty times worse than stated."""
     rng, truth = np.random.default_rng(7), circle_of(10.0)
     many = [views_of(truth, rng, frames=5) for _ in range(20)]
     unit = np.linalg.cholesky(outline_noise(many[0].moments))

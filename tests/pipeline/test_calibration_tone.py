@@ -31,7 +31,7 @@ from kgcp.targets.fields.layout import Field, GridKind
 
 
 class LosingPool(WorkerPool):
-    """Loses whatever it is given."""
+    """A pool that loses every job."""
 
     def map(
         self, function: Callable[..., Any], items: Iterable[Any]
@@ -42,7 +42,7 @@ class LosingPool(WorkerPool):
 
 
 class MeasuringPool(WorkerPool):
-    """Works at once, in this process."""
+    """A pool that works at once, in this process."""
 
     def map(
         self, function: Callable[..., Any], items: Iterable[Any]
@@ -55,7 +55,7 @@ UNRELIABLE = CameraTone(Tone.UNKNOWN, 1.0, is_reliable=False)
 
 
 class TellingPool(WorkerPool):
-    """Returns a tone, whatever it is given: an unreliable one where jobs are many."""
+    """A pool that returns a tone for any job: an unreliable one if there are many jobs."""
 
     def map(
         self, function: Callable[..., Any], items: Iterable[Any]
@@ -84,7 +84,7 @@ def test_without_a_learned_tone_there_is_a_warning_and_no_common_tone() -> None:
 
 
 def test_photographs_measured_with_another_tone_are_measured_again(tmp_path: Path) -> None:
-    """Of other photographs, another tone is learned."""
+    """Other photographs give another tone."""
     photo = Photo("a.png", tmp_path / "a.png")
     photo.path.write_bytes(b"nothing")
     pool, kinds = MeasuringPool(1, SerialExecutor(), (), Counter()), (PhotoDiscs, PhotoMiss)

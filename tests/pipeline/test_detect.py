@@ -84,7 +84,7 @@ class GuidedRuns:
     outs: tuple[Path, ...]
     sheets: tuple[Path, ...]
     summary: DetectionSummary  # of the first
-    were_kept: tuple[bool, ...]  # whether frames that were looked at again had been kept decoded
+    were_kept: tuple[bool, ...]  # whether frames of the second look had been kept decoded
 
     @property
     def tables(self) -> list[bytes]:

@@ -38,7 +38,7 @@ class ThisProcess:
 
 
 class Looks:
-    """All looks at frames, which show nothing, each with the base that it is over.
+    """Records of all looks at empty frames, each with the base used.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class Looks:
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Looks], None]:
-    """Look at all frames, and again at the first ones, with what the journal has."""
+    """Examine all frames, and the first ones again, with the contents of the journal."""
     target = TARGET_PLATE.target
     job = DetectionJob(tmp_path / "frames", CAMERA, None, (target,), DetectSettings())
     inputs = [FrameInput(frame, None, {}) for frame in FRAMES]
@@ -95,7 +95,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Looks], No
 def test_batches_over_both_bases_double_until_the_base_is_decided(
     run: Callable[[Looks], None], enough: int, asked: int
 ) -> None:
-    """Each of them lies evenly among all frames."""
+    """Each batch is spread evenly over all frames."""
     looks = Looks(ToneBase.SRGB, enough=enough)
     run(looks)
     bases = [*looks.first.values()]

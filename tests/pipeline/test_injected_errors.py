@@ -37,7 +37,7 @@ def corrections(flight: Path, old: str, new: str) -> tuple[Corrections, list[str
 
 @dataclass(frozen=True)
 class Injection:
-    """Words of flight.toml, what is written instead, and what that ought to be called."""
+    """Text of flight.toml, its replacement, and the expected name of the error."""
 
     old: str
     new: str

@@ -168,7 +168,7 @@ def test_candidates_need_a_contact_sheet(flight: Path) -> None:
 
 
 def test_the_best_ring_of_a_miss_is_shown_once(flight: Path) -> None:
-    """The other card is that of another place."""
+    """The other card shows a ring at another place."""
     miss = Miss("A", Reason.CUT, "ring at (20, 30)", 0.9, 1, Ellipse(20.0, 30.0, 6.0, 5.0, 0.1))
     dropped = tuple(
         Considered("A", "A-inner", outline, 0.4, is_match=False, reason=Reason.CODE_MISMATCH)

@@ -83,7 +83,7 @@ def test_every_target_is_measured_at_its_true_centre(folder: Path) -> None:
 
 
 def test_four_discs_can_orient_frames_check_a_vehicle_and_be_placed(folder: Path) -> None:
-    """As docs/ground.md tells it, from detections to points."""
+    """The steps of docs/ground.md, from detections to points."""
     flight = read_flight(folder)
     oriented = orient_flight(flight)
     assert len(oriented.oriented) == FLIGHT.frames
@@ -123,7 +123,7 @@ class Around(PlainFlight):
 
 
 def test_placed_normals_do_not_depend_on_the_stated_ones(tmp_path: Path) -> None:
-    """One on a roof, one said to be level, which is not: no frame's prior is in the result."""
+    """One on a roof, one wrongly stated to be level: the result does not contain the prior."""
     roof, tilted = (0.5, -0.2, 1.0), (-0.1, 0.05, 1.0)
     free = replace(plain_target("roof", (2.0, 2.0), 0.8), normal_enu=None)
     targets = (free, plain_target("tilted", (-2.5, -1.0), 0.7, polarity="dark"))
@@ -161,7 +161,7 @@ def test_check_lists_plain_targets(folder: Path) -> None:
 
 
 def test_a_changed_position_makes_detections_stale(folder: Path, tmp_path: Path) -> None:
-    """Its place is all that tells a plain target from others: points would be mixed up."""
+    """Plain targets differ only by their positions, so that points would be mixed up."""
     text = (folder / "flight.toml").read_text(encoding="utf-8")
     places = [line for line in text.splitlines() if line.startswith("position_m")]
     swapped = text.replace(places[0], "@").replace(places[1], places[0]).replace("@", places[1])
@@ -214,7 +214,7 @@ def test_manual_marks_predict_plain_targets(bare: Path) -> None:
     run("detect", bare, "--jobs", "0", "--places", str(bare / "places.csv"))
     rows = detections(bare).set_index("target")
     assert set(rows["status"]) == {"measured"}
-    assert_at(rows, centres_m, largest_sd_px=0.04)  # how the frame looks is hardly known
+    assert_at(rows, centres_m, largest_sd_px=0.04)  # the attitude of the frame is hardly known
 
 
 def test_a_poor_mark_does_not_keep_a_target_from_being_found(tmp_path: Path) -> None:

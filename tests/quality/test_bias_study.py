@@ -208,7 +208,7 @@ def test_errors_common_to_all_frames_are_stated_separately() -> None:
     )
     sds = study.measured[0].sds
     assert sds is not None
-    assert sds.common_m == pytest.approx(0.02, rel=1e-3)  # what is horizontal does not count
+    assert sds.common_m == pytest.approx(0.02, rel=1e-3)  # horizontal errors do not count
     assert sds.trajectory_m == pytest.approx(0.03, rel=1e-3)
 
 

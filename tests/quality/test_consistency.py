@@ -226,7 +226,7 @@ def test_only_injected_errors_are_found_within_their_deviations(name: str) -> No
     assert np.abs(standardised).max() < 4.0
     assert 0.8 < math.sqrt(np.mean(standardised**2)) < 1.25
     index = [unknown.name for unknown in UNKNOWNS].index(name)
-    assert tables[:, index, 1].max() < 0.25 * value  # a sigma that says something
+    assert tables[:, index, 1].max() < 0.25 * value  # a small, meaningful sigma
     for one in found:
         significant = [c.name for c in one.estimate.corrections if c.is_significant]
         assert significant == [name]

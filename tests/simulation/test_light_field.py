@@ -90,7 +90,9 @@ def test_narrow_stripes_never_reach_full_shade() -> None:
     x_m = np.linspace(-0.3, 0.3, 601)
     hidden = 1.0 - stripe.sunlight(x_m, np.zeros(601))
     assert hidden.max() == pytest.approx(4.0 / math.pi * 0.05 / 0.2, rel=0.02)  # chord / disc
-    assert hidden.sum() * 0.001 == pytest.approx(0.05, rel=1e-6)  # takes what a sharp one takes
+    assert hidden.sum() * 0.001 == pytest.approx(
+        0.05, rel=1e-6
+    )  # takes as much light as a sharp one
 
 
 def supersampled(field: PlateLight, edge: ConvexPolygon, factor: int) -> FloatArray:

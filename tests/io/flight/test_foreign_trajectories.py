@@ -109,5 +109,5 @@ def test_rtklib_positions_are_read_with_the_course_as_heading(
     exact, _ = places(tmp_path, 'trajectory = "vehicle.csv"')
     off = np.abs(found[0] - exact)
     sd = np.sqrt(np.diagonal(found[1], axis1=1, axis2=2))
-    assert 0.001 < np.abs(off[:, :2]).max() < 0.1  # what roll and pitch of 0 cost
+    assert 0.001 < np.abs(off[:, :2]).max() < 0.1  # the error of assuming roll and pitch of 0
     assert (off[:, :2] < 3.0 * sd[:, :2]).all()

@@ -214,7 +214,7 @@ class TestReadGrey:
 
     @pytest.mark.skipif(sys.platform != "linux", reason="counts memory as Linux does")
     def test_a_png_takes_no_more_memory_than_it_has_bytes(self) -> None:
-        """The chunk of an animated PNG says that it is 2 GB long, and some decoders believe it."""
+        """A chunk of an animated PNG states a length of 2 GB, which some decoders allocate."""
         path = Path(__file__).parents[3] / "fuzz/found/frames/long_chunk.png"
         script = """
 import resource, sys

@@ -28,7 +28,7 @@ FRAMES = 4
 
 @pytest.fixture(scope="module")
 def query() -> Iterator[str]:
-    """Have a server in a process of its own: Arrow waits for it without letting threads run."""
+    """Run the server in a separate process: Arrow waits for it without letting threads run."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = str(free.getsockname()[1])
     command = ["start", "--host", "127.0.0.1", "--port", port, "--in-memory"]

@@ -60,7 +60,7 @@ def test_damaged_headers_raise_no_exception(head: bytes, place: int, noise: byte
 
 
 def tags_of_the_same_bytes(count: int, size: int, start: int) -> bytes:
-    """A TIFF whose tags all have its last bytes."""
+    """A TIFF whose tags all refer to its last bytes."""
     entries = b"".join(struct.pack("<HHII", 40_000 + n, 7, size, start) for n in range(count))
     head = b"II*\0" + struct.pack("<IH", 8, count) + entries + bytes(4)
     return head + bytes(max(start + size - len(head), 0))

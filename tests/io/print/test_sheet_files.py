@@ -103,7 +103,7 @@ BETWEEN_DOTS_DEG = (28.0, 122.0, 140.0, 160.0)
 def test_diameters_are_true_at_600_dpi(
     rasterise: Callable[[Sheet, int], GreyArray], *, is_stretched: bool
 ) -> None:
-    """Whether it is to whole pixels that the page is stretched is up to who rasterises."""
+    """Rasterisers differ in whether they stretch a page to whole pixels."""
     sheet = bare_sheet()
     grey = rasterise(sheet, DPI)
     page_px = np.array(grey.shape[::-1])
@@ -181,7 +181,7 @@ def test_a_browser_draws_the_svg_at_its_true_size(tmp_path: Path) -> None:
 
 
 def random_targets(count: int) -> tuple[Target, ...]:
-    """Random codes, but none that flight.toml would not take beside the others."""
+    """Random codes that flight.toml would accept beside each other."""
     rng = np.random.default_rng(7)
     targets: list[Target] = []
     while len(targets) < count:

@@ -60,7 +60,7 @@ def test_the_target_s_own_code_passes(
 def test_a_fit_with_a_third_of_outliers_is_refused(
     fit_plate: FitPlate, *, outlying: float, is_refused: bool
 ) -> None:
-    """Clipped pixels are none, whatever their weight."""
+    """Clipped pixels are no outliers, whatever their weight."""
     fit = fit_plate(CODE, 40.0)
     count = len(fit.sample.levels)
     weight, at_high = np.ones(count), np.arange(count) < 0.4 * count

@@ -125,7 +125,7 @@ def test_a_pose_is_about_as_well_known_as_its_pixels_allow(fit: TargetFit) -> No
 
 
 def test_residuals_that_cancel_within_arcs_reduce_variances(fit: TargetFit) -> None:
-    """Sharpened noise does; but few arcs can agree by chance, and count as if some did not."""
+    """Sharpened noise cancels; few arcs may agree by chance, so that the ratio is drawn to 1."""
     pixels = np.rint(fit.sample.problem.window.pixels(fit.sample.index)).astype(int)
     score = np.where(pixels.sum(axis=0) % 2, 1.0, -1.0) * np.abs(fit.misfit.score)
     covariance = pose_covariance(replace(fit, misfit=replace(fit.misfit, score=score)))
@@ -135,7 +135,7 @@ def test_residuals_that_cancel_within_arcs_reduce_variances(fit: TargetFit) -> N
 
 
 def test_residuals_correlated_along_edges_enlarge_variances(fit: TargetFit) -> None:
-    """The same residuals, constant over each of some stripes: fewer independent ones."""
+    """The same residuals, constant over stripes: there are fewer independent ones."""
     x = fit.prediction.points_m[0] * fit.sample.problem.outer_radius_px / 0.45
     stripe = (x // 5.0).astype(int) - int(x.min() // 5.0)
     sign = np.random.default_rng(1).choice((-1.0, 1.0), stripe.max() + 1)[stripe]
@@ -159,7 +159,7 @@ def with_noisy_edges(fit: TargetFit, sign: FloatArray) -> TargetFit:
 def test_noise_of_edges_is_common_if_it_is_correlated_along_them(
     fit: TargetFit, run_px: float, least: float, most: float
 ) -> None:
-    """Compression's averages out; of a coarse print's, all of an edge may have some in common."""
+    """That of compression averages out; that of a coarse print may displace a whole edge."""
     rng, points_m = np.random.default_rng(5), fit.prediction.points_m
     sign = rng.choice((-1.0, 1.0), len(fit.sd))
     if run_px:
@@ -198,7 +198,7 @@ def with_sharpening(fit: TargetFit, behind: float, before: float) -> TargetFit:
 def test_edges_of_cameras_that_sharpen_may_be_displaced_where_levels_vary(
     fit: TargetFit, behind: float, before: float
 ) -> None:
-    """In even light, arcs show what processing displaces."""
+    """In even light, the scatter along arcs covers the effects of processing."""
     sharpened = with_sharpening(fit, behind, before)
     assert common_displacement_px(sharpened, 0.0) == 0.0005
     equations: Any = SimpleNamespace()

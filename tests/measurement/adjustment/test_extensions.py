@@ -79,7 +79,9 @@ def test_white_that_is_burnt_is_taken_for_clipped_over_all_bases(
     monkeypatch: pytest.MonkeyPatch, settled: ToneBase | None
 ) -> None:
     def fit(problem: FitProblem, *_: object) -> object:
-        if problem.burnt_white is None and problem.tone is Tone.UNKNOWN:  # the other one sees none
+        if (
+            problem.burnt_white is None and problem.tone is Tone.UNKNOWN
+        ):  # the other base finds no burnt white
             raise extensions.WhiteIsBurnt(replace(problem, burnt_white=0.92))
         return stand_in(best=stand_in(level_equations=None, sample=stand_in(problem=problem)))
 
@@ -168,7 +170,7 @@ def test_a_fit_with_an_implausible_curve_gives_way_to_the_other_base(
 @pytest.mark.parametrize(
     ("excess", "inflation", "radius_px", "binning", "is_asked"),
     [
-        (1.0, 6.5, 30.0, 1, False),  # even light, whatever else is wrong
+        (1.0, 6.5, 30.0, 1, False),  # even light with other misfits
         (1.3, 3.5, 30.0, 1, False),  # of a coarse renderer in even light
         (1.3, 6.5, 30.0, 1, True),  # dirt on a ring of 15 px
         (1.8, 1.0, 30.0, 1, False),
@@ -370,7 +372,7 @@ def started_under(
 def test_fits_start_from_the_light_of_visible_shadows(
     monkeypatch: pytest.MonkeyPatch, tone: Tone
 ) -> None:
-    """What edges add is relative to the contrast of the light, which half in shade is half."""
+    """The steps of edges are relative to the contrast of the light, which is half in shade."""
     light = np.array(((0.06, 0.7), (0.03, 0.35)))
     lit, shade = encoded(light[0], tone), encoded(light[1], tone)
     step = (shade - lit).tolist()

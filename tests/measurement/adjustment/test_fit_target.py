@@ -42,7 +42,7 @@ FILM = Sensor(tone=ToneCurve.FILM, sharpening=0.6, sharpening_px=1.1)
 
 @dataclass(frozen=True)
 class Errors:
-    """Of some measurements, against their truth."""
+    """Errors of measurements relative to the truth."""
 
     distance_percent: FloatArray
     distance_sigmas: FloatArray
@@ -108,7 +108,7 @@ def rms(values: FloatArray) -> float:
 def test_errors_of_small_rings_with_other_point_spreads_are_as_reported(
     errors_of: Callable[..., Errors], optics: Optics
 ) -> None:
-    """Residuals show skew or kurtosis, but too little to make them free: 2.0 and 1.9 without."""
+    """Residuals show too little skew or kurtosis to free them; otherwise z is 2.0, 1.9."""
     errors = errors_of(LENS, 9.5, 16, optics=optics)
     assert 0.57 < rms(errors.distance_sigmas) < 1.46  # 99 % of 16 values
     assert 0.69 < rms(errors.centre_sigmas) < 1.33  # 99 % of 32
@@ -180,7 +180,7 @@ def test_bases_of_an_unknown_tone_are_compared_on_the_same_pixels(
 def test_a_base_that_explains_a_frame_badly_is_compared_with_the_other(
     photograph: Photograph, start_near: StartNear, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Residuals that are alike may mean a fit that came to rest beside the minimum."""
+    """Correlated residuals may mean that the fit has not reached its minimum."""
     camera, rng = replace(LENS, response=Response.UNKNOWN), np.random.default_rng(7)
     pose = random_pose(camera, 40.0, rng)
     dirt = PlateLight(cloud=Cloud.drawn(Dirt(sd=0.06, correlation_m=0.12), rng))
@@ -252,7 +252,7 @@ def test_compression_does_not_hide_that_the_plate_is_burnt(
     seed: int,
     percent: float,
 ) -> None:
-    """It smears white over the levels below: taken as they were, they doubled the deviations.
+    """It smears white over the levels below; if these counted as exact, deviations would double.
 
     In the larger rings white made its own noise of them, and ran away with it.
     """
@@ -272,7 +272,7 @@ def test_compression_does_not_hide_that_the_plate_is_burnt(
 def test_compression_displaces_no_edges_of_a_stated_curve(
     photograph: Photograph, start_near: StartNear
 ) -> None:
-    """What it leaves of an edge is not quite sRGB's: rings were 0.0055 px too large, by 1.5 σ."""
+    """Compressed edges deviate from sRGB's curve: rings were 0.0055 px too large, by 1.5 σ."""
     camera, sigmas = replace(LENS, response=Response.SRGB), []
     for seed in range(8):
         rng = np.random.default_rng(seed)

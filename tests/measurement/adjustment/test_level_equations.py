@@ -17,7 +17,7 @@ FIRST_UNUSED = 10  # knots from there on are beyond all pixels
 
 @dataclass(frozen=True)
 class Problem:
-    """Equations with the levels eliminated, and what a dense adjustment has in their place."""
+    """Equations with the levels eliminated, and the same equations of a dense adjustment."""
 
     equations: LevelEquations
     misfit: Misfit
@@ -39,7 +39,7 @@ class Problem:
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     rng = np.random.default_rng(5)
-    # the first and the last knot tell the others, which may lie anywhere between them
+    # the first and the last knot determine the others, which may lie anywhere between them
     between = [(first + 1, last - 1) for first in range(4) for last in range(first + 3, 10)]
     cells = np.array([(a - 1, *sorted((a, b)), b + 1) for a, b in between])
     knots = cells[rng.integers(len(cells), size=PIXELS)]

@@ -122,7 +122,7 @@ def test_the_reach_of_a_blur_is_its_ellipse(blur: tuple[float, float, float]) ->
     ("black", "white", "share"),
     [
         (0.08, 0.75, 0.0),
-        (0.08, 0.33, 0.4),  # all plate is off its level, and what surrounds it
+        (0.08, 0.33, 0.4),  # plate and surroundings are off the plate's level
         (0.45, 0.75, 0.0),  # all ink, which is most of the ring: the light is wrong
     ],
 )

@@ -95,7 +95,7 @@ def test_where_a_streak_carries_the_surroundings_to_the_ring_nothing_is_used(
     imaging_of: ImagingOf,
     turn_deg: float,
 ) -> None:
-    """Along the streak the plate is nowhere as bright as across it, and ends within the blur."""
+    """Along the streak, the plate never reaches its full level, because it ends within the blur."""
     streak = (5.6, 2.0)
     pose = place_plate((205.4, 190.7), 13.0, turn_deg=turn_deg)
     image = image_plate(
@@ -169,7 +169,7 @@ def test_a_target_outside_its_window_has_lost_its_edges(
 def test_sharpening_depends_on_the_far_tails_of_edges(
     target: Target, camera: Camera, place_plate: PlacePlate, imaging_of: ImagingOf
 ) -> None:
-    """They take no part themselves. Against the whole window, exposed and sharpened by OpenCV."""
+    """These pixels are not adjusted themselves. Compared with the window sharpened by OpenCV."""
     pose = place_plate((205.4, 190.7), 12.0, tilt_deg=20.0, turn_deg=31.0)
     grey, _ = photograph(camera, target, pose, WIDE, WHITE)
     problem = replace(imaging_of(grey, camera, target, pose), sharpening_px=1.2)

@@ -138,7 +138,7 @@ def test_ink_under_glare_is_not_taken_for_plate(
     draw_frame: Callable[..., GreyArray],
     imaging_of: Callable[..., FitProblem],
 ) -> None:
-    """It is nearly as bright as half of the plate elsewhere, and so is the plate around it."""
+    """Ink under glare is nearly as bright as half of the plate elsewhere."""
     pose = place_plate(CENTRE_PX, 60.0)
     grey = draw_frame((target, pose), white=0.55)
     glare_px = CENTRE_PX[0] + 15.0
@@ -173,7 +173,7 @@ def noisy(problem: FitProblem, plate: float, of_ink: float, of_plate: float) -> 
     [
         (0.92, 1.0, 0.0, True),
         (0.92, 1.0, 0.5, False),  # it shows noise as ink does
-        (0.92, 0.0, 0.0, False),  # a picture without noise does not tell
+        (0.92, 0.0, 0.0, False),  # an image without noise cannot show burnt white
         (0.75, 1.0, 0.0, False),  # too dark
         (1.0, 1.0, 0.0, False),  # seen clipped
     ],
@@ -216,7 +216,7 @@ def test_burnt_white_is_recognised_beside_shade(
     target: Target,
     place_plate: Callable[..., Pose],
 ) -> None:
-    """Plate in shade has noise, and is as it is seen."""
+    """The plate in shade has noise and is not clipped."""
     problem = noisy(look(target)[0], 0.92, 1.0, 0.0)
     window = problem.window
     columns = window.pixels(np.arange(len(window.levels)))[0]

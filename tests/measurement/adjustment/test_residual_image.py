@@ -73,7 +73,7 @@ def test_slight_shade_on_a_small_ring_shows_in_the_residuals(
     way_deg: float,
     turn_deg: float,
 ) -> None:
-    """Of small rings, the covariance of the pose tells, although the pose is not adjusted here."""
+    """On small rings, the covariance of the pose shows it, even without an adjustment."""
     rng = np.random.default_rng(round(turn_deg / 30.0))
     centre_px = (200.0 + rng.uniform(), 170.0)
     pose = place_plate(centre_px, radius_px, tilt_deg=20.0, way_deg=way_deg, turn_deg=turn_deg)

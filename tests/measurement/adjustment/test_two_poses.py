@@ -40,7 +40,7 @@ def check_distance(seen: Measurement, truth: Pose) -> None:
 def test_a_start_tilted_in_the_wrong_direction_is_corrected(
     photograph: Callable[..., GreyArray], start_near: Callable[..., InitialPose], seed: int
 ) -> None:
-    """Three of these stayed near the tilt of 0, by 1.0 … 1.6 % too far away."""
+    """Without the correction, three of these stayed near a tilt of 0, 1.0 … 1.6 % too far away."""
     rng = np.random.default_rng(seed)
     pose = some_pose(rng)
     grey = photograph(LENS, pose, rng, sensor=FILM)
@@ -54,7 +54,7 @@ def test_a_start_tilted_in_the_wrong_direction_is_corrected(
 def test_from_straight_above_the_distance_is_found(
     photograph: Callable[..., GreyArray], start_near: Callable[..., InitialPose], seed: int
 ) -> None:
-    """Where nothing tells which way to tilt: steps that turned the plate over got nowhere."""
+    """Nothing determines the direction of the tilt; undamped steps would turn the plate over."""
     rng = np.random.default_rng(seed)
     pose = some_pose(rng)
     grey = photograph(LENS, pose, rng)

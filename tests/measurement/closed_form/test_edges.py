@@ -22,7 +22,7 @@ DrawFrame = Callable[..., GreyArray]
 
 
 def test_edge_points_lie_on_a_blurred_edge() -> None:
-    """An edge with a symmetric blur and a gentle curve: its inflection is where it is."""
+    """An edge with a symmetric blur and a slight curve has its inflection at its place."""
     rows, columns = np.indices((240, 260))
     radius = np.hypot(columns - 130.3, rows - 118.8)
     frame = (40.0 + 150.0 / (1.0 + np.exp(-(radius - 90.25) / 0.6))).astype(np.float64)

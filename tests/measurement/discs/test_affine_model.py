@@ -79,7 +79,7 @@ def test_shares_within_circles_are_those_of_a_gaussian_blur() -> None:
 
 
 def test_a_straight_edge_in_square_pixels_is_not_that_of_a_gaussian() -> None:
-    """Along x, the squares make 0.001 of the contrast; of that, less than a fifth is left."""
+    """Along x, square pixels change the profile by 0.001 of the contrast; a fifth of it is left."""
     geometry, sd = np.array([20.3, 19.6, 4000.0, 0.0, 4000.0]), 0.6
     geometry[0] -= 4000.0
     blur = Blur(sd**2 + PIXEL_PX2, sd**2 + PIXEL_PX2, 0.0)
@@ -118,7 +118,7 @@ def test_derivatives_are_those_of_the_share(name: str, *, is_ring: bool) -> None
             shares.append(pixels.white_share(moved, other).value)
         numeric = (shares[0] - shares[1]) / (2.0 * step)
         scale = np.abs(numeric).max()
-        # derivatives of what oblique blur does to the curvature are left out
+        # derivatives of the term of oblique blur and curvature are neglected
         assert slopes[row] == pytest.approx(
             numeric, abs=(0.12 if row in blurs else 0.02) * scale
         ), row

@@ -32,7 +32,7 @@ DISCS = tuple(
 
 
 def joint(tone: Tone, loss: float) -> JointFit:
-    """Return discs that agree with each other."""
+    """Return a joint fit of discs that agree with each other."""
     return JointFit(tone, 1.0, (), loss, np.eye(4), np.zeros((1, 4)), np.eye(4)[None])
 
 
@@ -57,7 +57,7 @@ def test_bent_curves_that_are_nearly_as_likely_are_compared_by_their_own_masks(
 @pytest.mark.parametrize(
     ("of_line", "worthy"),
     [
-        (740.0, {Tone.UNKNOWN_OVER_LINE}),  # a fifth of what the straight line is likelier by
+        (740.0, {Tone.UNKNOWN_OVER_LINE}),  # a fifth of the straight line's advantage
         (755.0, {Tone.UNKNOWN, Tone.UNKNOWN_OVER_LINE}),
         (765.0, {Tone.UNKNOWN}),
     ],
@@ -110,7 +110,7 @@ def small_discs(
 
 @functools.cache
 def light_of(levels: tuple[float, float], gradient: float, number: int) -> FloatArray:
-    """Return what a photograph of small discs is taken of: to draw it takes long."""
+    """Return the light of a scene of small discs, which takes long to render."""
     off_px = np.random.default_rng(number).uniform(-0.5, 0.5, 2)
     places = (24.0 * np.mgrid[-2:3, -1.5:2].reshape(2, -1).T + off_px) / 2e5
     discs = tuple(SimulatedDisc((x, y, 0.0), 10.0 / 2e5) for x, y in places.tolist())
@@ -120,7 +120,7 @@ def light_of(levels: tuple[float, float], gradient: float, number: int) -> Float
 
 
 def test_the_clipped_share_of_no_pixels_is_0() -> None:
-    """All of a window may be foreign: a mean of them would warn on stderr."""
+    """A window may have no usable pixels, whose mean would cause a warning of numpy."""
     none, both = np.zeros(0, np.bool_), np.array([True, False])
     assert Censoring(0.998, 0.002, none, none).share == 0.0
     assert Censoring(0.998, 0.002, both, ~both).share == 1.0
@@ -148,7 +148,7 @@ def test_an_unknown_curve_and_compression_are_recorded(
 
 
 def test_the_prior_of_burnt_white_does_not_bend_the_curve() -> None:
-    """Said by each disc, it did: first wave −0.19."""
+    """When each disc repeated the prior, the first wave became −0.19."""
     tasks = small_discs(Sensor(tone=ToneCurve.FILM), (0.62, 0.1), 0.004, 0)
     learned = learn_tone(tasks, Response.UNKNOWN)
     assert learned.prior is not None
@@ -160,7 +160,7 @@ def test_the_prior_of_burnt_white_does_not_bend_the_curve() -> None:
     ("levels", "seed"), [((0.1, 0.62), 0), ((0.62, 0.1), 100), ((0.1, 0.62), 101)]
 )
 def test_noise_does_not_bend_a_straight_line(levels: tuple[float, float], seed: int) -> None:
-    """Sharpened or not; of small discs, a curve that is bent by chance makes them 1 % larger."""
+    """Sharpened or not; a curve bent by chance would make small discs 1 % larger."""
     tasks = small_discs(Sensor(sharpening=0.5 * (seed > 0)), levels, 0.0, seed)
     learned = learn_tone(tasks, Response.UNKNOWN)
     assert learned.prior is not None
@@ -170,7 +170,7 @@ def test_noise_does_not_bend_a_straight_line(levels: tuple[float, float], seed: 
 
 
 def test_the_edge_of_a_shadow_does_not_bend_the_curve() -> None:
-    """Light of second order over some discs, held fast while all are adjusted, would (to sRGB)."""
+    """If light of second order were fixed in the joint adjustment, it would bend the curve."""
     scene = FieldScene(DISCS, 0.62, 0.1)
     grey = photograph(
         CAMERA,
@@ -217,7 +217,7 @@ def test_a_disc_with_a_bad_start_does_not_diverge() -> None:
 
 
 def test_a_state_converted_to_another_curve_has_the_same_grey_values() -> None:
-    """It is where steps begin anew: levels that stayed would be other grey values."""
+    """Steps restart from it: unchanged levels would mean other grey values."""
     vector = np.zeros(COUNT)
     vector[[Row.BLACK, Row.WHITE]] = 0.1, 0.62
     vector[Row.WAVE_1 : Row.SHARPENING] = 0.2, 0.1, -0.05

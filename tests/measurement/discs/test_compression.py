@@ -53,7 +53,7 @@ def small_discs(sensor: Sensor, seed: int, photographs: int = 5) -> list[GreyArr
 
 @functools.cache
 def light_of_small_discs(number: int) -> FloatArray:
-    """Return what all of these photographs are taken of: to draw it takes long."""
+    """Return the light of the scene of all these photographs, which takes long to render."""
     off_px = np.random.default_rng(number).uniform(-0.5, 0.5, 2)
     places = (24.0 * np.mgrid[-2:3, -1.5:2].reshape(2, -1).T + off_px) / 2e5
     discs = tuple(SimulatedDisc((x, y, 0.0), 10.0 / 2e5) for x, y in places.tolist())
@@ -99,7 +99,7 @@ def test_no_steps_are_found_in_uncompressed_or_shifted_photographs() -> None:
 @pytest.mark.parametrize("noise", [0.4, 0.8, 1.2])
 @pytest.mark.parametrize("blur_px", [1.0, 2.5, 4.0])
 def test_little_noise_is_not_taken_for_fine_steps(noise: float, blur_px: float) -> None:
-    """Its coefficients, of which few are above 1.4, are all near 2 then."""
+    """With little noise, the few coefficients above 1.4 are all near 2."""
     grey = discs_on_a_grid(blur_px, noise)
     for part in (grey, grey[:200, :200]):
         assert quantisation_steps(part) is None
@@ -122,7 +122,7 @@ def test_no_steps_are_read_from_blocks_that_begin_elsewhere(blur_px: float, qual
 
 
 def test_estimated_levels_before_compression_are_nearer_to_the_true_ones() -> None:
-    """By the model of the very disc: 3.8 grey values instead of 5.3; stated 2.8."""
+    """With the model of the disc itself: 3.8 grey values instead of 5.3; stated 2.8."""
     grey = small_discs(FILM, 5, 1)[0]
     photo = compressed(grey, 75)
     steps = quantisation_steps(photo)
@@ -148,7 +148,7 @@ def fits_of(photo: GreyArray, outlined: GreyArray) -> list[DiscFit]:
 
 
 def test_the_likelihood_of_coefficients_agrees_with_its_derivatives() -> None:
-    """Of the whole disc, with pixels that tell for themselves at the photograph's border."""
+    """For a whole disc, with pixels at the photograph's border that belong to no whole block."""
     grey = small_discs(FILM, 5, 1)[0][:, :126]
     photo = compressed(grey, 75)
     steps = quantisation_steps(photo)
@@ -178,7 +178,7 @@ def test_the_likelihood_of_coefficients_agrees_with_its_derivatives() -> None:
 
 
 def test_a_coefficient_contributes_only_the_information_of_its_interval() -> None:
-    """Nothing within a wide one; as much as a value once it is narrow; outliers little."""
+    """None in a wide interval, that of a value in a narrow one, and little for outliers."""
     photo = compressed(small_discs(FILM, 5, 1)[0], 92)
     places = np.mgrid[16:24, 16:24].reshape(2, -1)[::-1].astype(np.float64)
     model, sd = photo[16:24, 16:24].ravel() / 255.0, np.full(64, 1.0 / 255.0)
@@ -217,7 +217,7 @@ def test_a_curve_from_strongly_compressed_photographs_is_unreliable(sensor: Sens
 
 
 def test_steps_beyond_a_limit_of_the_curve_gain_most_along_it() -> None:
-    """As a general optimiser finds it. Cut off, they stay where they first meet the limit."""
+    """Compared with a general optimiser. If cut off, steps would stop where they meet the limit."""
     rng = np.random.default_rng(4)
     rows, least = wave_limits(Tone.UNKNOWN)
     normal = rng.normal(size=(4, 4))
@@ -242,13 +242,13 @@ def test_a_step_that_is_not_finite_is_refused() -> None:
 
 
 def test_film_s_curve_is_learned_through_jpeg() -> None:
-    """From the compressed values themselves it was sRGB's, with waves of 0.03 at most."""
+    """Learned from the compressed values directly, it was sRGB's, with waves of 0.03 at most."""
     tasks = tasks_of([compressed(photo, 92) for photo in small_discs(FILM, 0, 2)], 14)
     learned = learn_tone(tasks, Response.UNKNOWN)
     assert learned.prior is not None
     assert learned.tone is Tone.UNKNOWN  # a line, bent, is likelier by 3
     first, second, _, strength = learned.prior.mean.tolist()
-    assert -1.4 < first + 2.0 * second < -0.6  # what the dark end is steeper by; film's: -1.4
+    assert -1.4 < first + 2.0 * second < -0.6  # added slope at the dark end; film's: -1.4
     assert 0.4 < strength < 0.85
 
 
@@ -276,7 +276,7 @@ def test_radii_under_a_stated_curve_are_as_accurate_as_stated(
 
 
 def test_compression_does_not_displace_centres_in_uneven_light() -> None:
-    """A curve that may bend in each disc takes up JPEG's displacement: of 0.004 px here."""
+    """A curve that may bend in each disc absorbed JPEG's displacement, by 0.004 px here."""
     photos, truth = stated_photographs(ToneCurve.SRGB, 1.0, radius_px=110.0, side=2, fall=0.06)
     off = errors_of(photos, truth, Response.SRGB)
     assert len(off) == 8

@@ -39,7 +39,7 @@ ARCS = 10
 
 
 def scatter(ratio: float, over_blocks: float = 1.0) -> DiscScatter:
-    """Return that of a disc whose scatter over blocks is so much of the one over arcs."""
+    """Return the scatter of a disc over arcs, and over blocks relative to that."""
     blocks = BlockScatter(ratio * over_blocks, 4.0, 0.5 * ARCS)
     return DiscScatter(np.eye(5), np.zeros((5, 5)), ratio, ARCS, blocks, is_noise_alone=True)
 
@@ -187,7 +187,7 @@ def test_a_disc_with_too_few_unclipped_pixels_is_refused() -> None:
 
 
 def test_the_radius_of_a_single_disc_is_as_accurate_as_stated() -> None:
-    """Chance alone had its deviation stated 8 % too large."""
+    """Without the correction for chance, its deviation was 8 % too large."""
     camera = Camera(260, 260, 20_000.0, 20_000.0, 129.5, 129.5)
     places = [np.array([column, row]) * 42.0 for row in range(-2, 3) for column in range(-2, 3)]
     rng, z = np.random.default_rng(6), []

@@ -36,7 +36,7 @@ def field_of_discs(radius_px: float, rng: np.random.Generator) -> FieldScene:
 
 @functools.cache
 def light_of(scene: FieldScene, defocus_px: float) -> FloatArray:
-    """Return what photographs are taken of: to draw it takes longer than to measure them."""
+    """Return the light of the scene, which takes longer to render than to measure."""
     optics = Optics(0.6, aberration=Aberration(defocus_px=defocus_px))
     return field_irradiance(CAMERA, POSE, scene, optics)
 
@@ -76,14 +76,14 @@ def radius_errors_px(
 def test_radii_out_of_focus_are_right(
     tone: ToneCurve, response: Response, gain: float, most_px: float
 ) -> None:
-    """Taken for a Gaussian, they were off by 0.003, 0.40, 0.07 and 0.20 px."""
+    """With a Gaussian point spread, they were off by 0.003, 0.40, 0.07 and 0.20 px."""
     errors, _, kurtosis = radius_errors_px(2.0, tone, response, gain)
     assert abs(errors.mean()) < most_px
     assert -1.2 < kurtosis < -0.4
 
 
 def test_radii_of_burnt_discs_out_of_focus_are_as_accurate_as_stated() -> None:
-    """Without what focus does to burnt edges, they were off by 1.6 deviations."""
+    """Without the added deviation of burnt edges out of focus, they were off by 1.6 deviations."""
     errors, sds, _ = radius_errors_px(2.0, ToneCurve.LINEAR, Response.LINEAR, 1.5 / 0.62)
     assert 0.4 < np.sqrt(np.mean((errors / sds) ** 2)) < 1.35
 

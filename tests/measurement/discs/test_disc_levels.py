@@ -40,7 +40,7 @@ def levels(tone: Tone, values: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @pytest.mark.parametrize("tone", [Tone.LINEAR, Tone.SRGB, Tone.UNKNOWN, Tone.UNKNOWN_OVER_LINE])
 def test_derivatives_contain_changes_of_sharpened_neighbours(tone: Tone) -> None:
-    """Pixels that are not modelled are in the mask, and depend on light and tone as well."""
+    """The mask also covers pixels that are not modelled but depend on light and tone."""
     _, jacobian = levels(tone, vector())
     for row in LEVEL_ROWS:
         step = np.zeros(COUNT)
@@ -76,7 +76,7 @@ def test_curves_rise_everywhere() -> None:
 
 @pytest.mark.parametrize("tone", [Tone.UNKNOWN, Tone.UNKNOWN_OVER_LINE])
 def test_curves_do_not_darken_dark_light(tone: Tone) -> None:
-    """Than a straight line, by more than an error of the black level; steep curves can."""
+    """No curve is below a straight line by more than an error of the black level."""
     waves = np.array((-1.04, 0.63, -0.25) if tone.is_srgb else (-0.6, 0.0, 0.0))
     light = np.linspace(0.02, 0.4, 39)
     darker, allowed = (

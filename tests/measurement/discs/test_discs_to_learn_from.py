@@ -34,7 +34,7 @@ def tasks(radius_px: float, count: int = 60) -> list[DiscTask]:
 def test_more_discs_are_learned_from_if_they_are_small(
     radius_px: float, least: int, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of discs below 5 px nine, as of large ones: more of them do not tell tone from blur."""
+    """Of discs below 5 px, nine as of large ones: more would not separate tone from blur."""
     seen: list[int] = []
 
     def first_fits(chosen: Sequence[DiscTask], tone: Tone) -> list[DiscFit]:

@@ -92,7 +92,7 @@ def nearest(centres: FloatArray, moments: FloatArray) -> IndexArray:
 
 @pytest.mark.parametrize(("light", "sharpening"), [(0.7, 1.0), (1.3, 0.6)])
 def test_overshoots_of_sharpening_hide_no_disc(light: float, sharpening: float) -> None:
-    """It was taken for a hole, and discs were measured without their ink."""
+    """An overshoot was once taken for a hole, and discs were measured without their ink."""
     rendered = sharpened(light, sharpening)
     outlines = find_outlines(rendered.photo)
     assert len(outlines) == 10
@@ -108,7 +108,7 @@ def test_overshoots_of_sharpening_hide_no_disc(light: float, sharpening: float) 
 
 @pytest.mark.parametrize(("ground", "hole"), [(0.8, 0.2), (0.2, 0.8)])
 def test_narrow_rings_keep_their_fainter_edge(ground: float, hole: float) -> None:
-    """A fifth of the other's contrast is more than sharpening leaves."""
+    """A fifth of the other edge's contrast is more than an overshoot has."""
     places = (np.arange(4 * 120) + 0.5) / 4.0 - 0.5
     radius_px = np.hypot(places[:, None] - 58.3, places - 61.7)
     light = np.where(radius_px > 16.0, ground, np.where(radius_px > 12.5, 0.06, hole))
@@ -230,7 +230,7 @@ def test_discs_that_cannot_be_measured_have_a_reason(dark: Rendered) -> None:
 def test_the_prior_keeps_the_gradient_over_a_small_disc_small(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Where the ground is burnt, only that keeps its gradient from displacing the centre."""
+    """On burnt ground, only the prior keeps the gradient from displacing the centre."""
     discs = tuple(
         SimulatedDisc((0.012 * i, 0.012 * j, 0.0), 0.006)
         for j in range(-2, 3)
@@ -254,7 +254,7 @@ def test_the_prior_keeps_the_gradient_over_a_small_disc_small(
 
 
 def test_ink_of_small_discs_is_as_noisy_as_the_curve_of_srgb_makes_it() -> None:
-    """It is noisier than paper, and hardly seen: what edges show had been cut off at paper's."""
+    """It is noisier than paper and hardly visible; its noise was once limited to that of paper."""
     camera, pose = Camera(110, 70, 2e5, 2e5, 54.5, 34.5), Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
     sensor, rng, variances = Sensor(tone=ToneCurve.SRGB), np.random.default_rng(1), []
     lattice = 20.0 * np.array([(i, j) for i in range(-2, 3) for j in (-1, 0, 1)])
@@ -271,7 +271,7 @@ def test_ink_of_small_discs_is_as_noisy_as_the_curve_of_srgb_makes_it() -> None:
     assert len(variances) == 90
     of_light = np.sqrt(sensor.full_well_e * 0.1 + sensor.read_noise_e**2) / sensor.full_well_e
     of_ink = np.hypot(of_light * sensor.tone.slope(np.array(0.1)), 1.0 / 255.0 / np.sqrt(12.0))
-    # Paper's noise is 0.82 of it. One disc tells it to 40 %, and what would be below 0 is cut off,
+    # Paper's noise is 0.82 of it. One disc determines it to 40 %, and negative values are cut off,
     # which makes the mean larger.
     assert 0.9 < np.sqrt(np.mean(variances)) / of_ink < 1.35
 
@@ -301,7 +301,7 @@ def test_clipping_and_the_fit_make_noise_at_the_edges_of_burnt_discs_no_smaller(
 def test_noise_about_a_wrong_model_of_a_burnt_disc_is_not_small(
     levels: tuple[float, float],
 ) -> None:
-    """If all pixels were too near to what clips, nothing but the files' steps would be left."""
+    """If all pixels are too near to the limit, only the noise of rounding would remain."""
     camera, pose = Camera(60, 60, 2e5, 2e5, 29.5, 29.5), Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
     scene = FieldScene((SimulatedDisc((0.0, 0.0, 0.0), 20.0 / 2e5),), *levels)
     rng = np.random.default_rng(1)
@@ -322,7 +322,7 @@ def test_noise_about_a_wrong_model_of_a_burnt_disc_is_not_small(
 def test_a_disc_without_usable_pixels_is_refused(
     response: Response, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On ground with texture all pixels of a window may be taken for something else."""
+    """On textured ground, all pixels of a window may be masked as foreign."""
     pose, rng = Pose(np.eye(3), np.array([0.0, 0.0, 1.0])), np.random.default_rng(1)
     scene = FieldScene((SimulatedDisc((0.0, 0.0, 0.0), 0.03),), 0.8, 0.1)
     photo = photograph(CAMERA, pose, scene, Optics(0.6), Sensor(), rng)
@@ -356,7 +356,7 @@ def under_shadows(depth: float, width_px: float, aside_px: float) -> tuple[GreyA
 
 
 def rms_and_sd_px(photo: GreyArray, truth: FloatArray) -> tuple[float, float]:
-    """Measure all discs; return their centres' errors and what is stated of them."""
+    """Measure all discs; return the RMS errors of their centres and the stated deviations."""
     measured = measure_discs(photo, find_outlines(photo), response=Response.LINEAR)
     own = [each for each in measured if isinstance(each, Disc)]
     assert len(own) == len(truth)
@@ -369,7 +369,7 @@ def rms_and_sd_px(photo: GreyArray, truth: FloatArray) -> tuple[float, float]:
 def test_discs_under_the_edge_of_a_shadow_are_measured_accurately(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The photographer's shadow: light of first order leaves residuals, which count as errors."""
+    """As under the photographer's shadow, where light of first order leaves residuals."""
     photo, truth = under_shadows(0.3, 24.0, 10.0)
     rms_px, sd_px = rms_and_sd_px(photo, truth)
     assert 0.25 * sd_px < rms_px < 1.8 * sd_px

@@ -129,7 +129,7 @@ def test_errors_are_smaller_and_as_stated(
 
 
 def test_deviations_cover_stones_at_the_edge() -> None:
-    """They are no texture; taken for one, errors would be 1.6 times what is stated."""
+    """Stones are no texture; modelled as one, errors would be 1.6 times the stated ones."""
     rng, normalised = np.random.default_rng(7), []
     for _ in range(20):
         light = np.full((HEIGHT, WIDTH), 0.25)

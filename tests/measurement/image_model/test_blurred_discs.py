@@ -140,7 +140,7 @@ STREAKS = st.one_of(
 
 
 def some_disc(radius: float, blur: tuple[float, float, float], streak: tuple[float, float]) -> Disc:
-    """A disc with the rule that its radius and blur ask for."""
+    """A disc with the quadrature rule for its radius and blur."""
     sd_x, sd_y, correlation = blur
     covariance = np.array([[sd_x**2, 0.0], [0.0, sd_y**2]])
     covariance[0, 1] = covariance[1, 0] = correlation * sd_x * sd_y
@@ -226,7 +226,7 @@ def test_derivatives_are_those_of_the_level(rule: Quadrature, streak: tuple[floa
     if any(streak):
         numeric |= {BY_STREAK_X: slope(streak_x=step), BY_STREAK_Y: slope(streak_y=step)}
     for row, expected in numeric.items():
-        if rule is Quadrature.EDGE:  # what oblique blur adds has no derivatives
+        if rule is Quadrature.EDGE:  # the term of oblique blur has no derivatives
             off = np.linalg.norm(seen[row] - expected)
             assert off < 0.2 * np.linalg.norm(expected), row
         else:
@@ -263,7 +263,7 @@ def test_derivatives_of_an_edge_under_an_even_blur_are_those_of_the_level() -> N
 def test_the_closed_form_under_oblique_blur_agrees_with_chords(
     radius: float, blur: tuple[float, float, float, float, float]
 ) -> None:
-    """Blur or motion across the radius that goes with such along it."""
+    """Blur or motion whose parts along and across the radius are correlated."""
     x, y = around(radius, 5.0)
     edge, chords = (Disc(radius, r, *blur) for r in (Quadrature.EDGE, Quadrature.CHORDS_70))
     assert np.abs(edge.level(x, y) - chords.level(x, y)).max() < 6e-4
@@ -311,7 +311,7 @@ def test_a_smeared_edge_equals_the_mean_of_shifted_edges(length: float) -> None:
 
 
 def test_results_do_not_depend_on_the_number_of_pixels() -> None:
-    """However many there are of them: batches have a last one that is not full."""
+    """Pixels are computed in batches, of which the last may be incomplete."""
     disc = Disc(3.0, Quadrature.CHORDS_9)
     x, y = around(disc.radius, 3.0, 77)
     together = disc.seen(x, y)

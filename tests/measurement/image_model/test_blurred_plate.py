@@ -100,7 +100,7 @@ def test_white_share_jacobian_equals_finite_differences(index: int) -> None:
         )
     numeric = (levels[0] - levels[1]) / 2e-5
     # rotations and streaks leave out how they change the blur on the plate: second order; and all
-    # leave out derivatives of what oblique blur adds
+    # leave out derivatives of the term of oblique blur
     tolerance = 0.06 if index in {3, 4, 5} else 0.03
     assert np.abs(numeric - share.jacobian[index]).max() < tolerance * np.abs(numeric).max()
 
@@ -194,7 +194,7 @@ def test_quadrature_rules_hold_on_a_strongly_tilted_plate(streak: tuple[float, f
 
 
 def test_smoothing_along_contours_is_half_the_second_derivative_along_them() -> None:
-    """Of what is blurred already; on edges that are sharp against their curvature."""
+    """Applied to a blurred disc, whose blur is small compared with its radius."""
     sharp = Blur(0.3, 0.36, 0.04)
     circles = circles_of((RING,)).part(slice(0, 2))
     rays = rays_of(PIXELS)

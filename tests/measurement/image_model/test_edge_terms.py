@@ -66,7 +66,7 @@ def test_third_moments_displace_edges_as_two_gaussians_do() -> None:
     cumulant = variance * (1.0 - 2.0 * share) * shift_px
     spread = (each[0, 0] + variance, each[1, 1], 0.0)
     rows = skew_rows(_views(x, y), spread, _incidence(len(x)))
-    # what is odd in x is the skew's; all else is the spread's variance
+    # the part odd in x is due to the skew, all else to the spread's variance
     opposite = np.array([np.argmin((x + a) ** 2 + (y - b) ** 2) for a, b in zip(x, y, strict=True)])
     odd = 0.5 * (truth - truth[opposite])
     modelled = cumulant * rows[0]

@@ -141,7 +141,7 @@ def test_gradient_of_the_contrast_is_that_of_what_is_added() -> None:
 def test_steps_follow_levels_of_another_scale_everywhere(
     edges: int, spacings_px: tuple[float, ...]
 ) -> None:
-    """Where ink and plate change alone, light changes in proportion, whatever adds it."""
+    """If only ink and plate change, the added light of all kinds changes in proportion."""
     rng = np.random.default_rng(5)
     edge = np.array([[0.4, 3.0, 0.7, -0.1, -0.4]])[:edges]
     field, pixels = _field(spacings_px=spacings_px), _pixels()

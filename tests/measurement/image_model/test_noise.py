@@ -30,7 +30,7 @@ def all_clipped(count: int, *, high: bool) -> Censoring:
 
 
 def loss(levels: FloatArray, model: FloatArray, sd: FloatArray, clip: Censoring) -> FloatArray:
-    """The loss of each pixel: that of all when only one counts."""
+    """The loss of each pixel, computed with that pixel alone."""
     parts = []
     for i in range(len(model)):
         one = slice(i, i + 1)
@@ -136,7 +136,7 @@ def test_noise_follows_the_level() -> None:
 
 @pytest.mark.parametrize("from_edges", ["of both plateaus", "of ink and edges"])
 def test_noise_of_ink_is_extrapolated_to_pure_ink(from_edges: str) -> None:
-    """Its pixels have 2 % of plate in them, whose variance is six times as large."""
+    """Ink pixels contain 2 % of plate, whose variance is six times as large."""
     rng, found = np.random.default_rng(13), []
     for _ in range(60):
         of_ink = np.concatenate((np.zeros(650), 0.14 * rng.random(250)))
@@ -184,7 +184,7 @@ def test_a_band_counts_by_its_pixels_against_ten_of_the_line(pixels: int) -> Non
 
 @pytest.mark.parametrize("is_ink_seen", [False, True])
 def test_noise_of_an_unseen_plateau_is_taken_from_edges(is_ink_seen: bool) -> None:  # noqa: FBT001 - a case
-    """Of a narrow ring no pixel is wholly ink: it has not the noise of the plate."""
+    """A narrow ring has no pixel of pure ink, whose noise is not that of the plate."""
     rng = np.random.default_rng(9)
     found: dict[bool, list[tuple[float, float, float]]] = {True: [], False: []}
     for _ in range(20):
@@ -283,7 +283,7 @@ def test_levels_that_are_clipped_at_once_are_not_smeared() -> None:
 
 @pytest.mark.parametrize("burnt", [True, False])
 def test_levels_near_the_limit_beside_edges_alone_are_not_smeared(*, burnt: bool) -> None:
-    """An edge ends there, or one colour is not yet clipped; compression smears elsewhere, too."""
+    """Blurred edges end there, or one colour is not yet clipped; compression smears everywhere."""
     rng = np.random.default_rng(7)
     rows = np.full((WIDTH, WIDTH), 255.0)
     rows[:, 20:30] = (214.0, 120.0, *[30.0] * 6, 120.0, 214.0)

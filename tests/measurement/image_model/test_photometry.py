@@ -132,7 +132,7 @@ def test_photometric_rows_of_the_jacobian_are_derivatives(
 
 @pytest.mark.parametrize("tone", [each for each in Tone if each is not Tone.BINNED])
 def test_rows_of_the_jacobian_are_derivatives_in_uneven_light(tone: Tone) -> None:
-    """Levels differ from pixel to pixel, also of those that are only sharpened with others."""
+    """Levels differ from pixel to pixel, also for pixels that only sharpening uses."""
     light = replace(LIGHT if tone.is_shaped else UNSHAPED, linear_sharpening=0.0)
     light = replace(light, slope_x=0.0, slope_y=0.0, curvature=0.0, edge_tone=0.4)
     photometry = make_imager(tone, SHARPENING_PX)
@@ -181,7 +181,7 @@ def test_edge_tone_changes_the_white_share(edge_tone: float) -> None:
 
 @pytest.mark.parametrize("tone", [Tone.UNKNOWN, Tone.UNKNOWN_OVER_LINE])
 def test_the_light_varies_before_the_tone_curve(tone: Tone) -> None:
-    """Ink without light stays black; other pixels look as if they were whiter in even light."""
+    """Ink without light stays black; other pixels look like a larger white share in even light."""
     photometry, light = make_imager(tone, 0.0), replace(LIGHT, black=0.0)
     share = make_share(photometry).value
     even = replace(light, slope_x=0.0, slope_y=0.0)

@@ -67,7 +67,7 @@ def test_an_image_stretched_along_the_foreshortened_axis_seems_less_tilted() -> 
 
 @pytest.mark.parametrize("tilt_deg", [8.0, 15.0, 30.0])
 def test_correcting_a_known_rotation_restores_the_true_pose(tilt_deg: float) -> None:
-    """From the pose that was measured without it, to the one that it hid."""
+    """From the pose measured without the rotation to the true one."""
     pose = facing(tilt_deg)
     rotation = np.array([[0.08, -0.06, 0.05]])
     measured = displaced(pose, pose_displacements(pose, CIRCLES, DELAY_S, -rotation)[0])
@@ -93,7 +93,7 @@ def test_the_mean_square_is_that_of_many_rotations(tilt_deg: float) -> None:
 
 
 def test_first_derivatives_alone_understate_the_covariance() -> None:
-    """Of a plate that nearly faces the camera, the median of Mahalanobis distances tells."""
+    """The median of Mahalanobis distances shows it, for a plate that nearly faces the camera."""
     pose = facing(6.0)
     off = drawn(pose, 2000)
     slopes = pose_displacements(pose, CIRCLES, DELAY_S, 1e-4 * np.eye(3)) / 1e-4

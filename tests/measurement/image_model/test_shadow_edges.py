@@ -34,7 +34,7 @@ def test_a_shadow_is_half_as_deep_at_its_edge_and_whole_beyond() -> None:
 
 
 def test_a_shadow_within_another_has_no_effect() -> None:
-    """An antenna's takes light beside the shade of a building, and none within that."""
+    """An antenna's shadow takes light outside the shade of a building, and none within it."""
     upright = [0.0, 5.0, 0.0, -0.03, -0.5]
     strip = [[1.57, -2.0, 0.0, -0.03, -0.5], [1.57, 2.0, 0.0, 0.03, 0.5]]
     places = np.array([[-20.0, -20.0, 20.0, 20.0], [9.0, 0.0, 9.0, 0.0]])

@@ -51,7 +51,7 @@ def flat_under(
 
 
 def beyond(line: list[float], offsets: FloatArray) -> FloatArray:
-    """Return the share of a penumbra that is passed at places (2, n)."""
+    """Return Φ(distance / penumbra) of an edge at places (2, n)."""
     angle, offset_px, log_width = line
     along_px = math.cos(angle) * offsets[0] + math.sin(angle) * offsets[1]
     return np.asarray(ndtr((along_px - offset_px) / math.exp(log_width)))
@@ -84,7 +84,7 @@ def test_a_strip_has_two_edges_and_hides_nothing() -> None:
 
 
 def test_a_strip_is_distinguished_from_the_shade_that_it_runs_into() -> None:
-    """The edge comes first, although the strip adds to what it explains."""
+    """The edge is found first, although the strip increases the variance it explains."""
     first, both = find_shadows(flat_under([EDGE], STRIP), Tone.LINEAR)
     assert (first.edges.single_count, len(first.edges.rows)) == (1, 1)
     assert (both.edges.single_count, len(both.edges.rows)) == (1, 3)
@@ -102,7 +102,7 @@ def test_where_white_is_burnt_on_either_side_ink_shows_the_shadow() -> None:
 
 
 def test_a_highlight_beside_burnt_white_is_not_taken_for_shade() -> None:
-    """It adds to ink what it adds to white, which is not seen."""
+    """It adds the same to ink and to white, where it is not visible."""
     flat = flat_under([EDGE], [], ink=0.5, plate=1.9, left=0.4)
     assert find_shadows(flat, Tone.LINEAR) == []
 
@@ -125,7 +125,7 @@ def test_ink_that_is_brighter_than_plate_is_in_no_shade() -> None:
 
 
 def test_the_step_that_explains_most_is_found() -> None:
-    """Against sums over every pair of borders, by masks."""
+    """Compared with sums over every pair of borders."""
     rng = np.random.default_rng(8)
     offsets, kind = rng.uniform(-RADIUS_PX, RADIUS_PX, (2, 300)), rng.integers(0, 2, 300)
     values = rng.standard_normal(300) + 0.8 * (offsets[0] > 7.0)

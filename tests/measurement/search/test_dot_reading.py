@@ -35,7 +35,7 @@ def coded(code_deg: tuple[float, ...], name: str = "A") -> Target:
 
 
 def whole(code_deg: tuple[float, ...]) -> Target:
-    """A plate with a replica inside that carries the code of its own."""
+    """A plate whose replica carries another code than the main ring."""
     return Target(replace(RING, code_deg=code_deg), (RING.scaled("A-inner", 0.2, INNER),))
 
 
@@ -92,7 +92,7 @@ def test_closely_spaced_dots_are_read(
 def test_dirt_darker_than_the_ink_does_not_hide_the_dots(
     camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
 ) -> None:
-    """In haze, where the grey of ink is nearer to that of dots than to black."""
+    """In haze, ink is nearer to the grey value of dots than to black."""
     radius_px = 50.0
     pose = place_plate((240.0, 180.0), radius_px)
     frame = (150.0 + draw_frame((coded(RING.code_deg), pose)) * (70.0 / 255.0)).astype(np.uint8)

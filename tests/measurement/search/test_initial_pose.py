@@ -59,7 +59,7 @@ def test_a_large_outline_is_refined_in_the_frame(
     place_plate: PlacePlate,
     draw_frame: DrawFrame,
 ) -> None:
-    """Of rings of 100 px, outlines were off by up to 2 px, and starts tilted by 15° too much."""
+    """Without it, outlines of 100 px were off by up to 2 px, and starts tilted by 15° too much."""
     pose = place_plate((205.4, 160.7), 90.0, tilt_deg=12.0, way_deg=200.0, turn_deg=31.0)
     single = Target(target.ring)
     grey = draw_frame((single, pose))

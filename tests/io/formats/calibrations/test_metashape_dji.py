@@ -91,7 +91,7 @@ def test_metashape_documents_give_the_adjusted_calibration_of_a_sensor(
     two = one + SENSOR.format(id=1, label="FC6310R, 8.8mm")
     path = write(tmp_path, "cameras.xml", metashape_document(two))
     with pytest.raises(KgcpError, match="holds the cameras '0', '1'; choose one"):
-        read_calibration(path, SILENT)  # equal labels: the ids tell them apart
+        read_calibration(path, SILENT)  # equal labels: the ids distinguish them
     check(read_calibration(path, SILENT, camera="1"), metashape_px)
 
 
@@ -139,7 +139,7 @@ XMP = (
 
 
 def dji_px(points: FloatArray, brown: Brown) -> FloatArray:
-    """The middle of the photo is half its width and height from its corner."""
+    """Pixels of DJI's model, which counts from the middle of the photo."""
     middle = np.array([WIDTH, HEIGHT]) / 2 - 0.5
     return brown(points, (K1, K2, K3), (P1, P2)) * [1710.5, 1702.25] + middle + [12.25, -8.5]
 
