@@ -142,7 +142,7 @@ def test_a_times_file_that_cannot_be_read_is_all_that_is_said(flight: Path, text
 
 
 def test_detect_prints_the_doubts_before_it_measures(flight: Path, tmp_path: Path) -> None:
-    (flight / "frames").unlink()
+    (flight / "frames").rename(tmp_path / "all frames")
     (flight / "frames").mkdir()
     shutil.copy(SAMPLE / "frames" / "frame_0015.jpg", flight / "frames")
     change(flight, "flight.toml", "-1.95", "1.95")

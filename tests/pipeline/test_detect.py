@@ -54,11 +54,11 @@ def detect(folder: Path, out: Path, *edits: tuple[str, str], jobs: int = 0) -> D
     for old, new in edits:
         assert text.count(old) == 1, old
         text = text.replace(old, new)
-    (folder / "flight.toml").write_text(text, encoding="utf-8")
+    (folder / "flight.toml").write_text(text, encoding="utf-8", newline="\n")
     try:
         return detect_flight(read_flight(folder), out=out, options=RunOptions(jobs=jobs))
     finally:
-        (folder / "flight.toml").write_text(original, encoding="utf-8")
+        (folder / "flight.toml").write_text(original, encoding="utf-8", newline="\n")
 
 
 @pytest.fixture(scope="module")
