@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -83,9 +84,20 @@ def write_bytes(path: Path, content: bytes) -> None:
         with whole_file(path) as temporary:
             temporary.write_bytes(content)
     except OSError as error:
-        raise KgcpError(
-            f"{path}: cannot be written ({error}); choose another results folder", option="out"
-        ) from error
+        raise unwritable(path, error) from error
+
+
+def unwritable(path: Path, error: OSError) -> KgcpError:
+    """Return the error of a result that cannot be written.
+
+    On a full disk, another results folder would be the wrong remedy: an interrupted run can only be
+    resumed in the old one.
+    """
+    if error.errno in {errno.ENOSPC, errno.EDQUOT}:
+        return KgcpError(f"{path}: no space left; make room, then repeat the command")
+    return KgcpError(
+        f"{path}: cannot be written ({error}); choose another results folder", option="out"
+    )
 
 
 def write_all(contents: Mapping[Path, bytes]) -> None:

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from kgcp.errors import KgcpError
-from kgcp.io.files.atomic import whole_file
+from kgcp.io.files.atomic import unwritable, whole_file
 from kgcp.io.files.safe_read import is_file, unreadable
 from kgcp.io.tables.columns import Column, ColumnType, Row
 
@@ -60,9 +60,7 @@ def write_table(
                 group = chain((row,), islice(remaining, _ROWS_PER_GROUP - 1))
                 writer.write_table(_table(schema, group))
     except OSError as error:
-        raise KgcpError(
-            f"{path}: cannot be written ({error}); choose another results folder", option="out"
-        ) from error
+        raise unwritable(path, error) from error
 
 
 def _table(schema: pa.Schema, rows: Iterable[Row]) -> pa.Table:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -43,6 +45,19 @@ def test_a_link_in_the_way_is_not_followed(tmp_path: Path) -> None:
     write_bytes(tmp_path / "a.txt", b"content")
     assert elsewhere.read_bytes() == b"precious"
     assert (tmp_path / "a.txt").read_bytes() == b"content"
+
+
+def test_a_full_disk_asks_for_room_and_not_for_another_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(KgcpError, match=r"a\.txt: no space left; make room, then repeat") as caught:
+        write_bytes(tmp_path / "a.txt", b"content")
+    assert caught.value.option is None
+    assert not any(tmp_path.iterdir())
 
 
 def test_many_files_are_written_or_the_one_that_cannot_be_is_named(tmp_path: Path) -> None:
