@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 OPEN_FLAGS: int = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_CLOEXEC", "O_BINARY"))
 """For `os.open`, as far as the system has them: no links, not for child processes, no new lines."""
@@ -91,6 +91,12 @@ def peak_memory_mb() -> dict[str, float]:
     # macOS counts bytes, Linux kilobytes
     unit = _BYTES_PER_KB**2 if sys.platform == "darwin" else _BYTES_PER_KB
     return {name: resource.getrusage(each).ru_maxrss / unit for name, each in who.items()}
+
+
+def scratch_file() -> IO[bytes]:
+    """Open a nameless file: in memory on Linux, where full disks and lost folders do no harm."""
+    create: Any = getattr(os, "memfd_create", None)
+    return tempfile.TemporaryFile() if create is None else os.fdopen(create("scratch"), "w+b")
 
 
 @contextmanager

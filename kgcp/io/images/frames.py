@@ -6,7 +6,6 @@ import fnmatch
 import os
 import re
 import sys
-import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -21,6 +20,7 @@ import simplejpeg
 from kgcp.errors import KgcpError, Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
+from kgcp.io.files.portable import scratch_file
 from kgcp.io.files.safe_read import is_file, is_folder
 from kgcp.io.images.exif import read_exif
 from kgcp.io.images.header import (
@@ -298,7 +298,7 @@ def _collected_stderr() -> Iterator[list[str]]:
     restore the other's file as stderr.
     """
     messages: list[str] = []
-    with _STDERR_LOCK, tempfile.TemporaryFile() as sink:
+    with _STDERR_LOCK, scratch_file() as sink:
         if sys.stderr is not None:
             sys.stderr.flush()
         try:

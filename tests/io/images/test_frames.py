@@ -343,3 +343,17 @@ def test_programs_without_stderr_read_frames(
     monkeypatch.setattr(sys, "stderr", None)
     monkeypatch.setattr(os, "dup", no_descriptor)
     np.testing.assert_array_equal(read_grey(path, CAMERA), textured())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="others have a temporary file")
+def test_damage_is_noticed_without_a_temporary_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "gone"))
+    path = tmp_path / "frame.tif"
+    Image.fromarray(textured() & 0xE0).save(path, compression="tiff_lzw")
+    data = path.read_bytes()
+    assert read_grey(path, CAMERA).shape == (HEIGHT, WIDTH)
+    middle = len(data) // 2
+    path.write_bytes(data[:middle] + bytes(200) + data[middle + 200 :])
+    assert rejection(path).reason is Reason.DECODE_FAILED
