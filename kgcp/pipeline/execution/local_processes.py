@@ -45,12 +45,24 @@ def start_server(*modules: str) -> None:
     """Start the server of new processes, which loads these modules; return at once.
 
     Nothing is done if this system has no server, or if it is already running.
+
+    Raises
+    ------
+    KgcpError
+        If its socket cannot be created, as in a temporary folder with a long name.
     """
     if sys.platform == "linux":
         use_one_thread_each()
         forkserver.set_forkserver_preload(list(modules))
         with defer_interrupts():  # the server inherits this: Ctrl-C is for this process
-            forkserver.ensure_running()
+            try:
+                forkserver.ensure_running()
+            except OSError as error:
+                raise KgcpError(
+                    f"worker processes cannot be started ({error}); set TMPDIR to a folder with a"
+                    " short name and free space, or work without them",
+                    option="jobs 0",
+                ) from error
 
 
 class Preparation:

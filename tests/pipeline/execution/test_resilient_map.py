@@ -237,6 +237,23 @@ def test_processes_that_cannot_start_are_a_line(monkeypatch: pytest.MonkeyPatch)
     assert caught.value.on_command_line().endswith(" (--jobs 0)")
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a server of processes")
+def test_a_server_that_cannot_start_is_a_line(tmp_path: Path) -> None:
+    folder = tmp_path / ("long" * 25)  # longer than the address of a socket may be
+    folder.mkdir()
+    started = subprocess.run(
+        [sys.executable, "-m", "kgcp", "detect", str(tmp_path), "--jobs", "1"],
+        env={**os.environ, "TMPDIR": str(folder)},
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    assert started.returncode == 1
+    (line,) = started.stderr.splitlines()
+    assert line.startswith("kgcp: error: worker processes cannot be started (AF_UNIX path too long")
+    assert line.endswith("or work without them (--jobs 0)")
+
+
 def test_a_map_that_is_closed_early_does_not_wait(tmp_path: Path) -> None:
     start_s = time.monotonic()
 
