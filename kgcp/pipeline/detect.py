@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from kgcp.errors import KgcpError, SettingError
+from kgcp.io.files.atomic import remove
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.marks import HandMark, read_marks
@@ -27,7 +28,11 @@ from kgcp.measurement.frame import examine
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import FrameResult
 from kgcp.network.ground.exchanged_marks import exchanged_marks
-from kgcp.pipeline.detection_run import DetectionRun, ProgressListener
+from kgcp.pipeline.detection_run import (
+    DetectionRun,
+    ProgressListener,
+    refuse_to_lose_results,
+)
 from kgcp.pipeline.execution.compiled_code import compilation
 from kgcp.pipeline.execution.executor import WorkerPool, open_pool
 from kgcp.pipeline.execution.journal import Journal, fingerprint, to_text
@@ -116,6 +121,9 @@ class NoProgress:
         """Do nothing."""
 
 
+RUN_RECORD = "run.json"
+"""File name of the run's record, which appears last."""
+
 _DEFAULT_SETTINGS = DetectSettings()
 _DEFAULT_OPTIONS = RunOptions()
 _NEGATIVE = (
@@ -156,8 +164,9 @@ def detect_flight(
     ------
     KgcpError
         If there are no frames, a pattern matches none, a table of some frames would replace one of
-        all, the file of times or of reference poses is invalid, `out` cannot be written or is in
-        use by another process, the scheduler cannot be used, or frames disappear.
+        all, or an interrupted run's results of other frames would be lost, the file of times or of
+        reference poses is invalid, `out` cannot be written or is in use by another process, the
+        scheduler cannot be used, or frames change or disappear.
     """
     stopwatch = Stopwatch()
     out = results_folder(flight.folder) if out is None else Path(out)
@@ -166,10 +175,13 @@ def detect_flight(
         flight = replace(flight, frames_folder=flight.frames_folder.absolute())
     with stopwatch.stage("preparation"):
         task = _prepared_task(flight, settings, options)
+        path, is_new = out / ".detections.journal", options.is_restart
         if options.frame_patterns:
             refuse_to_replace_whole(out / DETECTIONS)
+            if not is_new:
+                chosen = {frame_input.frame for frame_input in task.inputs}
+                refuse_to_lose_results(path, [*set(task.all_frames).difference(chosen)])
     job = _job_of(task)
-    path, is_new = out / ".detections.journal", options.is_restart
     with Journal(path, _dependencies(job), (FrameResult,), is_new=is_new) as journal:
         with (
             _kept_frames(out, settings, options) as kept,
@@ -192,8 +204,10 @@ def detect_flight(
             with stopwatch.stage("learning"):
                 run.learn()
             likely_cause = _likely_cause(run, stopwatch)
+            run.require_unchanged_frames()
             if task.sheet is not None:
                 task.sheet.clear()
+            remove(out / RUN_RECORD)  # else an earlier run's would seem to be the new table's
             with stopwatch.stage("table"):
                 builder = _write_detections(out / DETECTIONS, run, task, predictions)
             not_drawn = 0
@@ -213,7 +227,7 @@ def detect_flight(
         )
         record = {**summary.numbers(), "jobs": pool.jobs, "settings": asdict(settings)}
         # after all workers have ended, because the record has their peak memory
-        write_run_record(out / "run.json", record)
+        write_run_record(out / RUN_RECORD, record)
         journal.remove()
     return summary
 

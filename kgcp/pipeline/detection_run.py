@@ -36,7 +36,7 @@ from kgcp.measurement.records import (
     is_unreadable,
 )
 from kgcp.pipeline.execution.executor import WorkerPool
-from kgcp.pipeline.execution.journal import Journal, fingerprint
+from kgcp.pipeline.execution.journal import Journal, fingerprint, results_in
 from kgcp.pipeline.execution.resilient_map import TaskFailure
 from kgcp.pipeline.frame_task import (
     DetectionJob,
@@ -57,6 +57,7 @@ from kgcp.quality.learnt_imaging import (
     learn_imaging,
     over_base,
 )
+from kgcp.quality.number_text import counted
 from kgcp.settings import Method
 
 _REASONS = {TaskFailure.CRASHED: Reason.WORKER_DIED, TaskFailure.TIMED_OUT: Reason.TIMED_OUT}
@@ -108,6 +109,31 @@ class FirstSizes:
             self._seen = self.FRAMES
         elif self._seen == self.FRAMES:
             (self.wrong,) = self._details
+
+
+def refuse_to_lose_results(journal: Path, frames: Sequence[str]) -> None:
+    """Refuse a run whose end deletes an interrupted run's results of other frames.
+
+    Parameters
+    ----------
+    journal : Path
+        File of the journal, which need not exist.
+    frames : sequence of str
+        Frames of the flight that are not to be examined.
+
+    Raises
+    ------
+    KgcpError
+        If there are results of such frames.
+    """
+    names = {_name_of(key) for key in results_in(journal)}
+    others = sum(_first_name(frame) in names for frame in frames)
+    if others:
+        raise KgcpError(
+            f"{journal}: has an interrupted run's results of {counted(others, 'other frame')},"
+            " which would be lost; finish that run, or name another folder with --out",
+            option="frames",
+        )
 
 
 class DetectionRun:
@@ -286,6 +312,31 @@ class DetectionRun:
                     self._keys[row] = keys[row]
                     self._keep(row, result)
 
+    def require_unchanged_frames(self) -> None:
+        """Stop if files have changed since the run began: results may be of either state.
+
+        A frame that was measured and then deleted does no harm.
+
+        Raises
+        ------
+        KgcpError
+            Naming one of them.
+        """
+        frames = [frame_input.frame for frame_input in self._inputs]
+        now = stamps_of(self._job.frames_folder, frames)
+        changed = [
+            frame
+            for frame, then, stamp in zip(frames, self._stamps, now, strict=True)
+            if stamp is not None and stamp != then
+        ]
+        if changed:
+            others = counted(len(changed) - 1, "other frame")
+            so_have = "" if len(changed) == 1 else f", and so have {others}"
+            raise KgcpError(
+                f"{self._job.frames_folder / changed[0]}: has changed during the run{so_have};"
+                " once all frames are in place, repeat the command, which resumes"
+            )
+
     def is_negative(self) -> bool:
         """Tell whether a target is measured in some frames if black and white are swapped."""
         readable = np.flatnonzero(self.tracks.is_readable)
@@ -417,7 +468,6 @@ class DetectionRun:
     def _key(self, row: int, tone_base: ToneBase | None) -> str:
         """Return the key of a first look."""
         frame_input, file = self._inputs[row], self._stamps[row]
-        name = fingerprint(frame_input.frame)[:16]
         known = (
             frame_input.time_s,
             frame_input.may_use_exif_time,
@@ -425,12 +475,17 @@ class DetectionRun:
             frame_input.plain,
             tone_base,
         )
-        return f"first-{name}-{fingerprint(file, *known)[:16]}"
+        return f"{_first_name(frame_input.frame)}-{fingerprint(file, *known)[:16]}"
 
 
 def _bits_reversed(number: int) -> int:
     """Return a number's 32 bits in reverse order: multiples of large powers of 2 come first."""
     return int(f"{number:032b}"[::-1], 2)
+
+
+def _first_name(frame: str) -> str:
+    """Return the part of a first look's key that identifies a frame."""
+    return f"first-{fingerprint(frame)[:16]}"
 
 
 def _name_of(key: str) -> str:

@@ -93,3 +93,21 @@ def test_some_frames_do_not_replace_the_table_of_all(
     assert unmeasured.run("detect", *FEW, "--out", str(tmp_path / "few")).exit_code == 0
     table.write_bytes(b"damaged")
     assert unmeasured.run("detect", *FEW).exit_code == 0
+
+
+def test_some_frames_do_not_end_an_interrupted_run_of_all(
+    unmeasured: SampleFlight, tmp_path: Path
+) -> None:
+    flight = read_flight(unmeasured.path)
+    with pytest.raises(KeyboardInterrupt):
+        detect_flight(flight, options=RunOptions(jobs=0), listener=Impatient(5))
+    message = unmeasured.fails("detect", *FEW, "--min-radius", "7")
+    assert "has an interrupted run's results of 3 other frames, which would be lost" in message
+    assert "(--frames)" in message
+    assert unmeasured.run("detect", *FEW, "--out", str(tmp_path / "few")).exit_code == 0
+    result = unmeasured.run("detect", "--jobs", "0")
+    assert "results of 5 of 5 frames are kept" in result.stderr
+    with pytest.raises(KeyboardInterrupt):
+        detect_flight(flight, options=RunOptions(jobs=0), listener=Impatient(5))
+    (unmeasured.out / "detections.parquet").unlink()
+    assert unmeasured.run("detect", *FEW, "--restart").exit_code == 0

@@ -276,6 +276,61 @@ def test_frames_that_vanish_stop_the_run_and_are_no_rows(
     assert looks["f_0.png"] == looks["f_3.png"] == 1
 
 
+def test_frames_that_change_stop_the_run_before_its_table(
+    flight: Path, undisturbed: bytes, looks: Counter[str]
+) -> None:
+    frames = flight / "frames"
+    whole = {name: (frames / name).read_bytes() for name in ("f_1.png", "f_7.png")}
+    for name, content in whole.items():
+        (frames / name).write_bytes(content[:1000])
+
+    class Copying(Stop):
+        def progress(self, stage: str, done: int, total: int, found: int) -> None:
+            super().progress(stage, done, total, found)
+            if (stage, done) == ("first look", total):
+                for name, content in whole.items():
+                    (frames / name).write_bytes(content)
+
+    with pytest.raises(
+        KgcpError, match=r"f_1\.png: has changed .*, and so have 1 other frame; once"
+    ):
+        detect(flight, Copying())
+    assert files(flight) == [".detections.journal"]
+    detect(flight)
+    assert table(flight) == undisturbed
+    assert [looks[f"f_{number}.png"] for number in (0, 1, 7)] == [1, 2, 2]
+
+
+def test_a_frame_that_is_deleted_after_its_measurement_keeps_its_row(
+    flight: Path, undisturbed: bytes
+) -> None:
+    class Deleting(Stop):
+        def progress(self, stage: str, done: int, total: int, found: int) -> None:
+            super().progress(stage, done, total, found)
+            if (stage, done) == ("second look", total):
+                (flight / "frames" / "f_1.png").unlink()
+
+    detect(flight, Deleting())
+    assert table(flight) == undisturbed
+
+
+def test_no_record_of_an_earlier_run_lies_beside_a_new_table(
+    flight: Path, undisturbed: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object, **__: object) -> int:
+        raise KeyboardInterrupt
+
+    detect(flight, min_radius_px=20.0)
+    assert table(flight) != undisturbed
+    monkeypatch.setattr("kgcp.pipeline.detect.draw_overlay", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        detect_flight(
+            read_flight(flight), options=RunOptions(jobs=0, overlay=flight / "kgcp" / "sheet")
+        )
+    assert table(flight) == undisturbed
+    assert files(flight) == [".detections.journal", "detections.parquet", "sheet"]
+
+
 def test_one_run_at_a_time(flight: Path, undisturbed: bytes) -> None:
     class Second(Stop):
         def progress(self, stage: str, done: int, total: int, found: int) -> None:

@@ -24,7 +24,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from enum import Enum
-from functools import cache
+from functools import cache, partial
 from io import FileIO
 from pathlib import Path
 from types import TracebackType
@@ -34,6 +34,7 @@ import numpy as np
 
 from kgcp.errors import KgcpError, Reason
 from kgcp.io.files.portable import OPEN_FLAGS, lock
+from kgcp.io.files.safe_read import is_file
 from kgcp.measurement import records
 from kgcp.measurement.discs.photograph import PhotoDiscs, PhotoMiss
 from kgcp.measurement.records import Considered, FrameResult, Imaging, Miss, TimeSource, ToneBase
@@ -243,8 +244,13 @@ class Journal(Generic[Result]):
         )
 
     def remove(self) -> None:
-        """Delete the journal, because the output is complete."""
+        """Delete the journal, because the output is complete.
+
+        If the user has deleted it, another run may have a new one of that name, which is kept.
+        """
         with self._access():
+            if not _is_at(self._path, self._writer):
+                return
             try:
                 self._path.unlink()  # before its lock is released
             except PermissionError:
@@ -268,9 +274,9 @@ class Journal(Generic[Result]):
         offsets: dict[str, int] = {}
         offset = 0
         while line := self._reader.readline(_MAX_LINE_BYTES):
-            checksum, _, body = line.partition(b" ")
-            if checksum == b"%08x" % zlib.crc32(body):
-                offsets[body.partition(b" ")[0].decode(errors="replace")] = offset
+            key = _key_of(line)
+            if key is not None:
+                offsets[key] = offset
             elif not line.endswith(b"\n"):  # the next line would be appended to it
                 self._writer.truncate(offset)
                 break
@@ -298,6 +304,33 @@ class Journal(Generic[Result]):
             self.seconds += time.monotonic() - began_s
 
 
+def results_in(path: Path) -> set[str]:
+    """Return the keys of all results in a journal; none if it cannot be read or is being written.
+
+    Opening it as a `Journal` reports such problems.
+    """
+    if not is_file(path):  # opening a pipe would wait for ever
+        return set()
+    with suppress(OSError), path.open("rb") as file:
+        lock(file.fileno())
+        lines = iter(partial(file.readline, _MAX_LINE_BYTES), b"")
+        return {key for key in map(_key_of, lines) if key not in {None, _MADE_BY}}
+    return set()
+
+
+def _key_of(line: bytes) -> str | None:
+    """Return the key of a line; None if the line is broken."""
+    checksum, _, body = line.partition(b" ")
+    if checksum != b"%08x" % zlib.crc32(body):
+        return None
+    return body.partition(b" ")[0].decode(errors="replace")
+
+
+def _is_at(path: Path, file: FileIO) -> bool:
+    """Tell whether a path still leads to a file that is open."""
+    return path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())
+
+
 def _locked(path: Path) -> FileIO:
     """Open a file for writing, created if needed, that no other process has open.
 
@@ -315,7 +348,7 @@ def _locked(path: Path) -> FileIO:
                     raise OSError(errno.EINVAL, "is not a file; delete it")
                 lock(file.fileno())
                 # another process may have deleted the file between opening and locking
-                if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                if _is_at(path, file):
                     stack.pop_all()
                     return file
     except BlockingIOError as error:

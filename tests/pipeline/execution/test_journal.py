@@ -32,7 +32,7 @@ from kgcp.measurement.records import (
     ToneBase,
     Uncertainty,
 )
-from kgcp.pipeline.execution.journal import Journal, fingerprint, from_text, to_text
+from kgcp.pipeline.execution.journal import Journal, fingerprint, from_text, results_in, to_text
 from tests.systems import needs_links, not_on_windows
 
 NO_RESULTS = (
@@ -337,3 +337,26 @@ def test_writing_takes_little_of_the_time(tmp_path: Path, monkeypatch: pytest.Mo
             now_s += 0.02
             journal.add(str(number), result(str(number)))
     assert 0.0 < journal.seconds < 0.015 * now_s
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows does not delete open files")
+def test_a_journal_that_was_deleted_ends_without_that_of_another_run(tmp_path: Path) -> None:
+    with open_journal(tmp_path) as journal:
+        (tmp_path / "journal").unlink()
+        journal.remove()
+        with open_journal(tmp_path) as other:
+            journal.remove()
+            assert (tmp_path / "journal").exists()
+            other.remove()
+    assert not (tmp_path / "journal").exists()
+
+
+def test_results_can_be_counted_without_the_journal(tmp_path: Path) -> None:
+    path = tmp_path / "journal"
+    assert results_in(path) == set()
+    with open_journal(tmp_path) as journal:
+        journal.add("key-0", FrameResult("0", 0.1, ExposureSettings(), ()))
+        assert results_in(path) == set(), "its run goes on"
+    path.write_bytes(path.read_bytes() + b"broken")
+    assert results_in(path) == {"key-0"}
+    assert path.read_bytes().endswith(b"broken"), "it is only read"
