@@ -8,7 +8,7 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from threading import Lock
 from typing import Any
@@ -212,6 +212,8 @@ def read_grey(path: Path, camera: Camera) -> GreyArray:
         `decode_failed`: it is not an image, is damaged in whole or in part (even if the decoder
         would fill the gap), or has another depth. `wrong_size`: its size is not the camera's, which
         is checked before decoding.
+    MemoryError
+        If there is no memory for the pixels.
     """
     grey = _decode(_encoded(path, camera))
     if grey.dtype not in (np.uint8, np.uint16):
@@ -262,8 +264,12 @@ def _decode(encoded: bytes) -> GreyArray:
     grey = _decode_jpeg(encoded) if encoded.startswith(JPEG_START) else None
     if grey is not None:
         return grey
-    with _collected_stderr() as messages, suppress(cv2.error):
-        grey = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), _RAW_GREY)
+    with _collected_stderr() as messages:
+        try:
+            grey = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), _RAW_GREY)
+        except cv2.error as error:
+            if error.code == cv2.Error.StsNoMem:  # for the pixels; the file may be sound
+                raise MemoryError(error.err) from error
     if grey is None:
         raise Rejection(Reason.DECODE_FAILED, f"{len(encoded)} bytes that are not a complete image")
     for message in messages:

@@ -236,7 +236,7 @@ def _serve(connection: _Connection) -> None:
 
 
 def _answer(connection: _Connection) -> None:
-    """Receive and make calls; send what they return or raise."""
+    """Receive and make calls; send what they return or raise. End if memory runs out."""
     function: Any = None  # the function to call, until another one is received
     while True:
         data = connection.recv_bytes()
@@ -247,6 +247,8 @@ def _answer(connection: _Connection) -> None:
                 function = sent
             else:
                 result = function(*sent)
+        except MemoryError:
+            return  # a new process can have all of the memory, and may try again
         except Exception as raised:
             error = _portable(raised)
         connection.send((result, error))

@@ -357,3 +357,17 @@ def test_damage_is_noticed_without_a_temporary_folder(
     middle = len(data) // 2
     path.write_bytes(data[:middle] + bytes(200) + data[middle + 200 :])
     assert rejection(path).reason is Reason.DECODE_FAILED
+
+
+def test_a_lack_of_memory_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "frame.png"
+    path.write_bytes(encoded(textured(), ".png"))
+
+    def full(*_: object) -> None:
+        error = cv2.error("as OpenCV says it")
+        error.code, error.err = cv2.Error.StsNoMem, "Failed to allocate 48000000 bytes"
+        raise error
+
+    monkeypatch.setattr(cv2, "imdecode", full)
+    with pytest.raises(MemoryError, match="Failed to allocate 48000000 bytes"):
+        read_grey(path, CAMERA)

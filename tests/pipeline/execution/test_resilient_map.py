@@ -75,6 +75,13 @@ def fail_oddly(_: int) -> int:
     raise OddError("this", "that")
 
 
+def run_out_of_memory(folder: Path, item: int) -> int:
+    if item == DEADLY or not (folder / str(item)).exists():
+        (folder / str(item)).touch()
+        raise MemoryError
+    return item
+
+
 def pid_and(*values: object) -> tuple[int, tuple[object, ...]]:
     return os.getpid(), values
 
@@ -107,6 +114,13 @@ def test_what_kills_its_process_is_lost_and_nothing_else(tmp_path: Path) -> None
     lost = {DEADLY: TaskFailure.CRASHED, SLOW: TaskFailure.TIMED_OUT}
     assert results == {item: lost.get(item, item * item) for item in range(9)}
     assert (tmp_path / "died").exists(), "died once, and was tried again"
+
+
+def test_what_lacks_memory_is_tried_again_in_another_process(tmp_path: Path) -> None:
+    with pool(2) as executor:
+        items = (DEADLY, UNLUCKY)
+        results = dict(resilient_map(partial(run_out_of_memory, tmp_path), items, executor, 2))
+    assert results == {DEADLY: TaskFailure.CRASHED, UNLUCKY: UNLUCKY}
 
 
 def test_few_items_are_taken_before_their_time() -> None:
