@@ -164,11 +164,11 @@ class FlightBias:
         files["bias_report.html"] = render_page(content).encode()
         table = folder / "bias.parquet"
         rows = (bias_row(pair, study.method) for pair in study.measured)
+        for name in {*FIGURE_FILES.values(), *files}:
+            remove(folder / name)  # of an earlier run: it does not show these numbers
         write_table(table, BIAS_COLUMNS, rows, self.provenance)
         for name, data in files.items():
             write_bytes(folder / name, data)
-        for name in set(FIGURE_FILES.values()) - files.keys():
-            remove(folder / name)  # left by an earlier run: it does not show these numbers
         paths = (table, *(folder / name for name in files))
         return Report(content.summary, content.verdict, paths)
 

@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
+from kgcp.errors import KgcpError
 from kgcp.geometry.pose import Pose
 from kgcp.georef.sighting import Attempt, Exposure, Sighting
 from kgcp.io.flight.flight import read_flight
@@ -298,6 +299,21 @@ def test_an_interrupted_report_leaves_that_of_the_run_before(
     with pytest.raises(KeyboardInterrupt):
         of_sample(study(compare(40.0, 0.2))).write_report(tmp_path, reexpose=0)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_report_that_cannot_be_written_is_not_mixed_with_that_of_the_run_before(
+    compare: Compare, study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    of_sample(study(compare(30.0, 0.1))).write_report(tmp_path, reexpose=0)
+    assert (tmp_path / "bias_report.html").exists()
+
+    def full(path: Path, _: bytes) -> None:
+        raise KgcpError(f"{path}: no space left; make room, then repeat the command")
+
+    monkeypatch.setattr("kgcp.pipeline.bias_report.write_bytes", full)
+    with pytest.raises(KgcpError, match="no space left"):
+        of_sample(study(compare(40.0, 0.2))).write_report(tmp_path, reexpose=0)
+    assert [path.name for path in tmp_path.iterdir()] == ["bias.parquet"]
 
 
 def test_without_times_deviations_or_poses_there_is_a_page_too(
