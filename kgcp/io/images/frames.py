@@ -309,7 +309,7 @@ def _collected_stderr() -> Iterator[list[str]]:
             sys.stderr.flush()
         try:
             stderr = os.dup(2)
-        except OSError:  # programs of windows alone have no stderr on Windows
+        except OSError:  # graphical programs have none on Windows
             yield messages
             return
         os.dup2(sink.fileno(), 2)
