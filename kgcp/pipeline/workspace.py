@@ -6,12 +6,13 @@ import hashlib
 import os
 import tempfile
 import tomllib
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from kgcp.errors import KgcpError
+from kgcp.errors import KgcpError, KgcpWarning
 from kgcp.io.flight.flight import Flight
 from kgcp.io.images.frames import FRAME_SUFFIXES, RESULTS_NAME
 from kgcp.io.images.remote import StoredFolder
@@ -198,6 +199,13 @@ def _deliver(folder: Path, out: StoredFolder, fetched: Sequence[Path]) -> None:
             (out / path.relative_to(folder).as_posix()).write(path)
     except KgcpError as error:
         raise KgcpError(f"{error} (the results are in {folder}: copy them by hand)") from error
+    except BaseException:  # interrupted: the journal is gone, so that nothing would be resumed
+        warnings.warn(
+            f"{out}: does not have all results yet; they are in {folder}: copy them by hand",
+            KgcpWarning,
+            stacklevel=2,
+        )
+        raise
     for path in (*results, *fetched):
         path.unlink()
     folders = [path for path in folder.rglob("*") if path.is_dir() and path.name[0] != "."]
