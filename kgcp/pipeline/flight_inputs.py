@@ -372,7 +372,7 @@ def missing_frames(flight: Flight, sightings: Sequence[Sighting]) -> tuple[Doubt
     return (
         mild(
             Cause.UNREADABLE,
-            f"{flight.frames_folder}: frames with the target that are not there any more:"
+            f"{flight.frames_folder}: frames with the target that are no longer there:"
             f" {len(missing)} of {len(frames)} ({missing[0]}{', …' if len(missing) > 1 else ''})",
             "repeat 'kgcp detect' if they are not to be used",
         ),

@@ -108,9 +108,11 @@ def test_other_frames_are_refused(measured: SampleFlight) -> None:
     (frames / FRAMES[0]).unlink()
     partial = measured.run("export-gcp")
     assert partial.exit_code == 0
-    assert f"not there any more: 1 of 4 ({FRAMES[0]}); repeat 'kgcp detect'" in partial.stderr
+    assert f"no longer there: 1 of 4 ({FRAMES[0]}); repeat 'kgcp detect'" in partial.stderr
     frames.rename(measured.path / "archive")
-    assert "not there" not in measured.run("export-gcp").stderr, "frames may move to an archive"
+    assert "no longer there" not in measured.run("export-gcp").stderr, (
+        "frames may move to an archive"
+    )
     (measured.path / "archive").rename(frames)
     shutil.copy(frames / FRAMES[1], frames / FRAMES[0])
     assert "changed since 'kgcp detect': files of frames; " in measured.fails("export-gcp")
