@@ -88,6 +88,14 @@ def _open_all_streams() -> None:
             setattr(sys, name, open(number, mode, encoding="utf-8", closefd=False))  # noqa: SIM115 - to the end
 
 
+def _drop_unwritten_output() -> None:
+    """Discard what stdout cannot take; Python 3.13 would try again at its end, and complain."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 class Program(click.Group):
     """The `kgcp` command: imports a command when it is called, prints known errors as one line."""
 
@@ -106,6 +114,7 @@ class Program(click.Group):
             where = "" if error.filename is None else f"{error.filename}: "
             text = f"kgcp: error: {where}no space left; make room, then repeat the command"
             click.echo(text, err=True)
+            _drop_unwritten_output()
             sys.exit(_EXIT_KNOWN_ERROR)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
