@@ -81,7 +81,7 @@ def test_arguments_mean_what_was_typed(
 
 
 @pytest.mark.usefixtures("windows")
-def test_options_that_a_quotation_mark_has_swallowed_are_told() -> None:
+def test_options_that_a_quotation_mark_has_swallowed_are_reported() -> None:
     result = CliRunner().invoke(main, ["detect", 'D:\\my photos" --jobs 2'])
     assert result.exit_code == 2
     assert "leave out the backslash before the quotation mark" in result.stderr

@@ -98,7 +98,7 @@ class OpenFile:
         monkeypatch.setattr(Path, name, refused)
 
 
-def test_a_file_that_is_open_elsewhere_is_told_and_kept(
+def test_a_file_that_is_open_elsewhere_is_reported_and_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "kgcps.csv"
@@ -122,7 +122,7 @@ def test_a_file_that_is_open_for_a_moment_is_replaced(
     assert path.read_bytes() == b"new"
 
 
-def test_what_cannot_be_deleted_is_told(tmp_path: Path) -> None:
+def test_what_cannot_be_deleted_is_reported(tmp_path: Path) -> None:
     remove(tmp_path / "not there")
     (tmp_path / "a").mkdir()
     with pytest.raises(KgcpError, match=r"a: is a folder"):

@@ -67,7 +67,7 @@ def test_lines_are_read_as_they_are_wanted(tmp_path: Path) -> None:
         list(read_lines(path, KEY))
 
 
-def test_a_file_that_another_program_has_is_told(
+def test_a_file_that_another_program_has_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As Windows refuses it; none of the keys that name the file is wrong."""

@@ -114,7 +114,7 @@ def test_a_cluster_that_loses_a_worker_gives_the_bytes_of_this_process(
     assert (flight.parent / "dask" / "run.json").exists()
 
 
-def test_what_dask_gives_up_is_tried_again_or_a_line() -> None:
+def test_what_dask_gives_up_is_tried_again_or_ends_in_one_line() -> None:
     with connected("local:1", 60.0, ()) as workers:
         for error, kind in (
             (
@@ -153,7 +153,7 @@ def test_workers_must_be_as_the_run_needs_them(
         pass
 
 
-def test_a_scheduler_that_is_of_no_use_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scheduler_that_is_of_no_use_is_a_one_line_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("kgcp.pipeline.execution.dask_client._CONNECT_S", 0.5)
     monkeypatch.setattr("kgcp.pipeline.execution.dask_client._WORKERS_S", 0.4)
     monkeypatch.setattr("kgcp.pipeline.execution.dask_client._WATCH_S", 0.2)

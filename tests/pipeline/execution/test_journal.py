@@ -279,7 +279,7 @@ def test_a_result_that_cannot_be_read_again_is_an_error(key: str, tmp_path: Path
 
 
 @not_on_windows("limits no sizes of files")
-def test_a_full_disk_is_a_line_and_the_journal_stays(tmp_path: Path) -> None:
+def test_a_full_disk_is_a_one_line_error_and_the_journal_stays(tmp_path: Path) -> None:
     program = (
         "import resource, signal\n"
         "from kgcp.errors import KgcpError\n"
@@ -300,14 +300,14 @@ def test_a_full_disk_is_a_line_and_the_journal_stays(tmp_path: Path) -> None:
     assert keys(tmp_path) == ["key-0"]
 
 
-def test_what_is_in_the_way_is_a_line(tmp_path: Path) -> None:
+def test_what_is_in_the_way_is_a_one_line_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(KgcpError, match=r"cannot be written .*; choose another results folder"):
         open_journal(tmp_path / "file")
 
 
 @needs_links
-def test_a_link_in_the_way_is_a_line(tmp_path: Path) -> None:
+def test_a_link_in_the_way_is_a_one_line_error(tmp_path: Path) -> None:
     (tmp_path / "precious").write_bytes(b"mine")
     (tmp_path / "journal").symlink_to(tmp_path / "precious")
     with pytest.raises(KgcpError, match=r"journal: cannot be written \(is a link; delete it\)"):
@@ -316,7 +316,7 @@ def test_a_link_in_the_way_is_a_line(tmp_path: Path) -> None:
 
 
 @not_on_windows("has no pipes in folders")
-def test_a_pipe_in_the_way_is_a_line(tmp_path: Path) -> None:
+def test_a_pipe_in_the_way_is_a_one_line_error(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "journal")
     with pytest.raises(KgcpError, match=r"journal: cannot be written \(is not a file; delete it\)"):
         open_journal(tmp_path)

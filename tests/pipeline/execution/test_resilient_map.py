@@ -243,7 +243,7 @@ def test_a_signal_waits_for_the_end_of_a_call_in_this_process() -> None:
     assert steps == ["1 ended"]
 
 
-def test_processes_that_cannot_start_are_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_that_cannot_start_are_a_one_line_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("kgcp.pipeline.execution.local_processes._serve", end_process)
     text = "end as soon as they start; free memory"
     with pool(1) as executor, pytest.raises(KgcpError, match=text) as caught:
@@ -252,7 +252,7 @@ def test_processes_that_cannot_start_are_a_line(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a server of processes")
-def test_a_server_that_cannot_start_is_a_line(tmp_path: Path) -> None:
+def test_a_server_that_cannot_start_is_a_one_line_error(tmp_path: Path) -> None:
     folder = tmp_path / ("long" * 25)  # longer than the address of a socket may be
     folder.mkdir()
     started = subprocess.run(
