@@ -25,7 +25,7 @@ def distance_of(count: int, dots: int) -> float:
     Raises
     ------
     SettingError
-        If it is not possible to propose so many codes.
+        If it is not possible to propose this many codes.
     """
     targets = new_targets((), 0.9, (), count, dots)
     check_new_codes(targets, ())

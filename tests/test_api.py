@@ -151,7 +151,7 @@ def test_the_method_is_taken_as_a_word() -> None:
             lambda: untyped_measure(FRAME, CAMERA, [kgcp.Target(RING)], {"method": "paper"}),
             "settings: is a dict; give a kgcp.DetectSettings",
         ),
-        (lambda: untyped_replace(RING, code_deg=43), "code_deg: 43 is no list"),
+        (lambda: untyped_replace(RING, code_deg=43), "code_deg: 43 is not a list"),
         (lambda: untyped_replace(CAMERA, k1="0.1"), "k1: is not a finite number"),
         (lambda: untyped_settings(is_guided="no"), "is_guided: 'no' is neither True nor False"),
         (lambda: untyped_settings(is_learning=None), "is_learning: None is neither True nor"),

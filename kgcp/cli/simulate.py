@@ -126,7 +126,7 @@ PRESET_NAMES = (
     "--motion",
     type=(float, float),
     metavar="X Y",
-    help="Move the image by so many px/s while rows are exposed.  [default: the preset's, or a"
+    help="Move the image by this many px/s while rows are exposed.  [default: the preset's, or a"
     " random motion in each frame]",
 )
 @click.option(

@@ -18,7 +18,7 @@ from kgcp.georef.local_frame import LocalFrame, level_axes_ecef
 
 ENU_FROM_NED: FloatArray = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
-# An interval is a gap if it is longer than both: this time, and so many medians of the interval.
+# An interval is a gap if it is longer than both: this time, and this many medians of the interval.
 _MIN_GAP_S = 0.5
 _GAP_INTERVALS = 1.5
 # Largest ratio of neighbouring steps of a spline. Beyond it, noise over the shorter step bends the

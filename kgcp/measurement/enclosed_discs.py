@@ -18,7 +18,7 @@ _LEAST_AREA = 3.0  # of a region, relative to the area of its discs
 
 
 def enclosed_discs(grey: GreyArray, count: int, response: Response) -> list[list[Disc]]:
-    """Find closed regions with exactly so many discs of one polarity.
+    """Find closed regions with exactly this many discs of one polarity.
 
     A boundary is any closed shape: a line around the discs, or the edge of a plate. Regions with
     the same discs count once.

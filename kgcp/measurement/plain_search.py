@@ -12,7 +12,7 @@ from kgcp.measurement.discs.outlines import follow_outlines
 from kgcp.measurement.discs.records import DiscOutline, Polarity
 
 _SPACING = 0.4  # spacing of the start places, in smaller semi-axes
-# How far an edge may be from a start: in radii, but at least so many pixels
+# How far an edge may be from a start: in radii, but at least this many pixels
 _REACH, _LEAST_REACH_PX = 0.45, 2.0
 # Two outlines are of the same edge if their centres are nearer than this (in radii) and the ratio
 # of their radii is smaller than this.

@@ -41,8 +41,8 @@ _MEDIAN_NORM = math.sqrt(2.0 * math.log(2.0))  # of two standard normal numbers
 # Lower limit of the robust standard deviation, relative to the stated one. If all discs fit better
 # than stated, none is an outlier.
 _MIN_DEVIATION = 0.1
-# The best-fitting discs of each photograph are kept whatever their residuals: at least so many, and
-# at least this share. Fewer might not determine the pose.
+# The best-fitting discs of each photograph are kept whatever their residuals: at least this many,
+# and at least this share. Fewer might not determine the pose.
 _MIN_DISCS, _MIN_SHARE = 6, 1.0 / 3.0
 # Upper limit of a photograph's own robust standard deviation, relative to that of all discs.
 _MAX_PHOTOGRAPH_DEVIATION = 10.0

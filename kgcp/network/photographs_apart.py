@@ -19,7 +19,7 @@ from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem
 # An RMS below this multiple of the stated standard deviation of the discs leaves nothing to
 # explain: all photographs fit.
 _FITTING_RATIO = 1.5
-# At most this share of the photographs may stand apart, and at least so many must remain.
+# At most this share of the photographs may stand apart, and at least this many must remain.
 _MAX_SHARE = 0.25
 _MIN_REMAINING = 4
 _TRIED = 4  # photographs with the largest residuals, of which one is left out in each round

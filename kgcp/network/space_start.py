@@ -15,7 +15,7 @@ _TRIALS, _CONFIDENCE = 200, 0.999  # of RANSAC
 # Largest residual of an inlier, relative to the frame's longer side: it allows for distortion and a
 # wrong focal length, but not for wrong names.
 _MAX_RESIDUAL = 0.02
-# Around the best of `FOCALS`, finer steps are tried: so many on either side, with this ratio. The
+# Around the best of `FOCALS`, finer steps are tried: this many on either side, with this ratio. The
 # network then adjusts the focal length.
 _FINE_STEPS = 2
 _FINE_RATIO = 1.15

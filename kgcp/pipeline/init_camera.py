@@ -62,7 +62,7 @@ def _by_file(contents: FolderContents, size: tuple[int, int]) -> Section | None:
 
     A camera.toml of kgcp comes first: it has a covariance.
     """
-    for path in sorted(contents.calibrations, key=lambda each: not _is_own(each)):
+    for path in sorted(contents.calibrations, key=lambda each: not _is_camera_toml(each)):
         try:
             camera = _read(path, size)
         except KgcpError:  # of another size, or of several cameras
@@ -91,13 +91,13 @@ def _unfit_files(contents: FolderContents, size: tuple[int, int]) -> Iterator[Ga
             yield Gap("camera", f"{contents.relative(path)} is not used: it {problem}", remedy)
 
 
-def _is_own(path: Path) -> bool:
+def _is_camera_toml(path: Path) -> bool:
     return path.suffix == ".toml"
 
 
 def _read(path: Path, size: tuple[int, int]) -> Camera:
     """Return the camera of a file, if it is one of frames of this size."""
-    if not _is_own(path):
+    if not _is_camera_toml(path):
         return read_calibration(path, size, words=_WORDS)
     camera, _ = read_camera_file(path)
     if (camera.width, camera.height) != size:
@@ -109,7 +109,7 @@ def _read(path: Path, size: tuple[int, int]) -> Camera:
 
 
 def _has_size(path: Path) -> bool:
-    if _is_own(path):
+    if _is_camera_toml(path):
         return True
     try:
         read_calibration(path, (None, None))

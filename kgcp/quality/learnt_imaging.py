@@ -36,7 +36,7 @@ _MAX_SHARE_AGAINST = 0.2
 # Least sum of advantages with which the first frames decide for all others: at least 5 clear ones.
 _CLEAR_ADVANTAGE = 5.0 * _MAX_FRAME_ADVANTAGE
 # The base does not matter if this quantile of the distances' differences between both bases is
-# below this share of a standard deviation, in at least so many frames. The quantile is 0.02 in
+# below this share of a standard deviation, in at least this many frames. The quantile is 0.02 in
 # flights with rolling shutters and 0.2 to 0.3 with film-like curves; it is 0.5 to 1.3 with
 # highlights, phones or dirt.
 _SAME_DISTANCE_SIGMAS, _SAME_DISTANCE_QUANTILE, _MIN_FRAMES = 0.35, 0.8, 12

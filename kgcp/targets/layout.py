@@ -68,7 +68,9 @@ class Ring:
                 "make code_diameter_m ± dot_diameter_m lie between the ring's diameters",
             )
         if np.ndim(self.code_deg) != 1:
-            raise SettingError("code_deg", f"{self.code_deg!r} is no list", "list all dots")
+            raise SettingError(
+                "code_deg", f"{self.code_deg!r} is not a list", "list the angles of all dots"
+            )
         if len(self.code_deg) == 0:  # it may be an array
             raise SettingError("code_deg", "is empty", "give the direction of at least one dot")
         if len(self.code_deg) > _MAX_DOTS:

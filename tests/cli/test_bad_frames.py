@@ -96,7 +96,7 @@ def test_commands_that_need_detections_fail_in_one_line_before_detect(
 
 
 def sized(flight: Path, count: int, *sizes: tuple[int, int]) -> None:
-    """Let the flight have so many frames, of sizes that take turns."""
+    """Let the flight have this many frames, of sizes that take turns."""
     for frame in (flight / "frames").iterdir():
         frame.unlink()
     for number in range(count):

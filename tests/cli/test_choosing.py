@@ -50,7 +50,7 @@ def test_a_table_of_selected_frames_is_accepted_for_the_flight(unmeasured: Sampl
 
 
 class Impatient(NoProgress):
-    """Interrupts a run after so many frames."""
+    """Interrupts a run after this many frames."""
 
     def __init__(self, patience: int) -> None:
         self.patience = patience

@@ -349,7 +349,7 @@ def test_poses_assigned_to_other_frames_are_refused(
     ("arguments", "problem"),
     [
         (("--targets", "A,Z"), "'Z': is not in flight.toml"),
-        (("--min-frames", "40"), "reference pose; 40 are needed); look whether enough frames show"),
+        (("--min-frames", "40"), "reference pose; 40 are needed); check that enough frames show"),
         (("--poses", "none.csv"), "none.csv: does not exist; name a file of poses (--poses)"),
         (("--poses", "."), ".: is no file; name a file of poses (--poses)"),
     ],

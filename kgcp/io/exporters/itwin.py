@@ -38,9 +38,9 @@ Into a block that you have already:
 1. Export the block as BlocksExchange XML.
 2. python add_to_block.py BLOCK.xml
    writes BLOCK_kgcp.xml: the same block with kgcp's points, without the moving points of an earlier
-   export. Photos are found by their file names;
-   those of several flights that have the same name, by a folder with the flight's name. The script
-   prints which ones are not in the block. It needs Python, and nothing else.
+   export. Photos are found by their file names; those of several flights that have the same name,
+   by a folder with the flight's name. The script prints which ones are not in the block. It needs
+   Python, and nothing else.
 3. Import BLOCK_kgcp.xml as a block, and submit the aerotriangulation with control points.
 
 As a block of its own, with the images that show the target: copy block.xml into the folder of the

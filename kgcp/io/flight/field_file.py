@@ -78,7 +78,8 @@ def read_field(text: str, unit: str | None = None) -> AnyField:
 def _refuse_unit(text: str, unit: str | None) -> None:
     if unit is not None:
         raise KgcpError(
-            f"{text}: has lengths of a known unit, which {unit!r} would not change; leave it out",
+            f"{text}: states its own unit of length, so that {unit!r} would be ignored; leave it"
+            " out",
             option="unit",
         )
 

@@ -44,8 +44,9 @@ def _are_counted(frames: Sequence[str]) -> bool:
     matches = [_SECONDS.search(PurePosixPath(frame).stem) for frame in frames]
     digits = [match[3] for match in matches if match is not None and match[3] is not None]
     numbers = sorted(map(int, digits))
-    is_series = numbers == [*range(numbers[0], numbers[0] + len(numbers))] if numbers else False
-    return is_series and len(numbers) == len(frames) > 1
+    if len(numbers) < max(2, len(frames)):
+        return False
+    return numbers == [*range(numbers[0], numbers[0] + len(numbers))]
 
 
 def _time_s(stem: str) -> float | None:

@@ -28,7 +28,7 @@ _MIN_PIXELS = 3  # to tell the light at a position
 _EXTRA_DOT, _MISSING_DOT = 0.45, 0.6
 # A dot is moved if one side of it has so much more light and the other side so much less.
 _MOVED_DOT = 0.2
-_DOTS_PER_MISSING = 4  # one dot in so many may be missing, hidden by dirt
+_DOTS_PER_MISSING = 4  # one dot in this many may be missing, hidden by dirt
 
 
 def edge_noise(fit: TargetFit) -> float:

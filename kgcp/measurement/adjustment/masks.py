@@ -212,7 +212,7 @@ def _mark_foreign(
 
 @compiled
 def _fill_ellipse(xx: float, yy: float, xy: float, sigmas: float, kernel: GreyArray) -> None:
-    """Fill in 1 within so many σ of a blur around the middle, 0 elsewhere."""
+    """Fill in 1 within this many σ of a blur around the middle, 0 elsewhere."""
     half, limit = kernel.shape[0] // 2, sigmas * sigmas * (xx * yy - xy * xy)
     for row in range(-half, half + 1):
         for column in range(-half, half + 1):

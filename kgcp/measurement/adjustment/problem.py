@@ -34,7 +34,8 @@ class FitProblem:
     window: Window
     ring: Ring  # the target's main ring, whose code must be seen
     circles: Circles  # all circles of the plate
-    # the first so many circles are measured; the others are only modelled, as under the start pose
+    # number of circles, from the first on, that are measured; the others are only modelled, as
+    # under the start pose
     measured_count: int
     # of the ring that is measured
     outer_radius_m: float

@@ -172,7 +172,7 @@ def adjust(
 ) -> TargetFit:
     """Estimate the unknowns in rounds, each with its own choice of pixels, noise and outliers.
 
-    If `max_pixels` is given, at most so many are used; if there are more, the estimate is rough.
+    If `max_pixels` is given, at most this many are used; if there are more, the estimate is rough.
 
     Raises
     ------

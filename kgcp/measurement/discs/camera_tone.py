@@ -40,8 +40,8 @@ from kgcp.measurement.image_model.compression import is_compressed_near, quantis
 from kgcp.measurement.image_model.photometry import Tone
 
 # How many discs of a photograph are learned from: so many that their radii add up to this, and at
-# least so many. Nine dark discs of R 3.5 px under film's curve would be too few: they miss a fifth
-# of its second wave, which displaces centres by 0.002 px.
+# least this many. Nine dark discs of R 3.5 px under film's curve would be too few: they miss a
+# fifth of its second wave, which displaces centres by 0.002 px.
 _RADII_PX, _FEWEST_DISCS = 110.0, 9
 _LEAST_RADIUS_PX = 5.0  # of discs to learn from, if there are enough
 # From this radius on, discs show a gradient of the darker level of its own, unless the curve is
@@ -49,7 +49,7 @@ _LEAST_RADIUS_PX = 5.0  # of discs to learn from, if there are enough
 _LARGE_RADIUS_PX = 20.0
 _LARGEST_BLUR = 0.3  # of the radius, to start from
 # Masks around σ = 1 px are tried in steps of this factor, if the camera sharpens: if the strength
-# is at least the first and at least so many standard deviations.
+# is at least the first and at least this many standard deviations.
 _MASK_STEP, _MOST_STEPS = 1.25, 2
 _LEAST_SHARPENING, _SIGNIFICANT = 0.05, 4.0
 _BENT = {Tone.SRGB: Tone.UNKNOWN, Tone.LINEAR: Tone.UNKNOWN_OVER_LINE}

@@ -14,7 +14,7 @@ from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
 
 RAYS = 48
 _STEP_PX = 0.5  # between samples
-_SLOPE_STEPS = 2  # a slope is taken over so many samples on either side
+_SLOPE_STEPS = 2  # a slope is taken over this many samples on either side
 _MOST_SAMPLES = 64
 _ANGLES = 2.0 * np.pi / RAYS * np.arange(RAYS)
 DIRECTIONS = np.stack((np.cos(_ANGLES), np.sin(_ANGLES)), axis=-1)

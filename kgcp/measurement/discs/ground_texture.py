@@ -68,7 +68,7 @@ class Sector:
 
 
 def sectors_about(centre_px: FloatArray, places_px: FloatArray, most_pixels: int) -> list[Sector]:
-    """Divide pixels (2, n) by their direction from a centre (2,), into sectors of so many at most.
+    """Divide pixels (2, n) by their direction from a centre (2,) into sectors of limited size.
 
     Sectors are treated as independent: the correlation of texture across their borders is left out.
     """

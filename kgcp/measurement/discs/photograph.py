@@ -28,7 +28,7 @@ from kgcp.targets.fields.point_naming import name_by_codes, name_by_places
 from kgcp.targets.fields.points import AnyField
 
 _LEAST_DISCS = 6
-# To see a small hole, a disc is sampled on circles of these radii (in its own), in so many
+# To see a small hole, a disc is sampled on circles of these radii (in its own), in this many
 # directions
 _MIDDLE, _INK, _GROUND, _DIRECTIONS = 0.1, 0.72, 1.6, 16
 _LIKE_GROUND = 0.4  # of the contrast: a middle that differs from the ink by more is a hole

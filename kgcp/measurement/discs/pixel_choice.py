@@ -19,7 +19,7 @@ from kgcp.measurement.image_model.blur import Blur
 # band has more pixels that are not ground.
 _FLAT_PX = 3.0
 _REACH_SIGMAS = 3.5
-# Pixels nearer to another edge than so many σ plus pixels are left out, as its blur reaches them.
+# Pixels nearer to another edge than this many σ plus pixels are left out, as its blur reaches them.
 # On crowded boards little ground is left, and nearer pixels are used: the other edge changes them
 # by 2 % of the contrast at most, which costs less than to miss them.
 _CLEAR, _CROWDED = (2.8, 0.6), (2.0, 0.4)

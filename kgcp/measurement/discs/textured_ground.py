@@ -56,7 +56,7 @@ _UNSETTLED_PX = 0.02  # if the last step is larger, there is no result
 # Most pixels of a sector. With 150, stated deviations are 7 % smaller than errors; with 400, 2 %.
 _MOST_PIXELS = 400
 _MOST_IN_MODES, _TEXTURE_SECTORS = 150, 8  # pixels, and number, of sectors that tell the texture
-_EVERY_OF_MIDDLE = 7  # one in so many pixels of the disc's middle is used: for its level
+_EVERY_OF_MIDDLE = 7  # one in this many pixels of the disc's middle is used: for its level
 # Pixels that see at least this share of ground tell the texture; those that see at most this share
 # are on the disc.
 _GROUND, _DISC = 0.98, 0.5

@@ -39,7 +39,7 @@ _MAX_STEP = 255
 # A step is accepted if the mean of cos(2π c / step) over coefficients c is at least this share of
 # the value that is left after the rounding of pixels.
 _MIN_PERIODICITY = 0.6
-# Compression is detected if so many of the 64 steps are determined, and if this is at least the
+# Compression is detected if this many of the 64 steps are determined, and if this is at least the
 # given share of the steps for which there are enough coefficients. With JPEG the share is 0.6 or
 # more. It is at most 0.45 if nothing was compressed, or if the photograph was cropped or resized so
 # that the blocks begin elsewhere. (It is not 0 then, because coefficients that become rare above

@@ -20,7 +20,7 @@ from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 
 OUTLIER_SIGMAS = 3.5
-"""A value farther from the model than so many standard deviations is an outlier."""
+"""A value farther from the model than this many standard deviations is an outlier."""
 # Distance below the clipping limit, in σ, at which the score of a clipped pixel equals that of an
 # outlier at its limit. Beyond, the score is kept constant.
 _MAX_CLIPPED_SIGMAS = 3.23249
@@ -70,7 +70,7 @@ _BEYOND_CLIPPING = 0.1
 _BAND_LIMITS = np.array([0.02, 0.15, 0.35, 0.65, 0.85, 0.98])
 _BAND_MIDDLES = np.array([0.005, 0.07, 0.25, 0.5, 0.75, 0.93, 0.995])
 # The variance of a band is a weighted mean of its own and of that on the line between ink and
-# plate. The line weighs as much as so many pixels.
+# plate. The line weighs as much as this many pixels.
 _LINE_PIXELS = 10.0
 
 

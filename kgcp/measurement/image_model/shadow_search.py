@@ -23,7 +23,7 @@ from kgcp.measurement.image_model.shadow_edges import (
     ShadowEdges,
 )
 
-_ENOUGH_EDGES = 4  # the search ends with so many
+_ENOUGH_EDGES = 4  # the search ends with this many
 _DIRECTIONS, _BORDERS = 36, 61  # tried over half a turn, and across the plate
 _MIN_PIXELS = 12  # of ink or of plate, on either side of a step
 # Share of the variance that the first step must explain, and share of the remaining variance that

@@ -51,7 +51,7 @@ def unblurred_plate(
     circles : Circles
         All circles of the plate.
     measured_count : int
-        The first so many circles are measured.
+        Number of circles, from the first on, that are measured.
     rays : (6, n) array
         As in `Window`.
     small_radius_m : float

@@ -67,7 +67,7 @@ def read_dots(grey: GreyArray, outline: Ellipse, ring: Ring) -> FloatArray:
 def _centres_of_runs(is_bright: BoolArray, dot_deg: float) -> FloatArray:
     """Return the directions [deg] of dots from runs of bright samples around a circle.
 
-    A run as wide as several dots counts as so many dots.
+    A run as wide as several dots counts as that many dots.
     """
     count = len(is_bright)
     step_deg = 360.0 / count

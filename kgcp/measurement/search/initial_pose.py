@@ -46,7 +46,7 @@ _MIN_REFINED_RADIUS_PX = 4.0 * MIN_TRACKED_RADIUS_PX
 _REFINE_REACH, _REFINE_SAMPLES = 0.045, 33  # half length of the profiles, in radii; samples on each
 _RISE_SAMPLES = 6  # over which the increase of the grey values is measured
 _MIN_RISE = 0.3  # relative to the median one; shade leaves more, an occluded edge has less
-# Edge points are dropped if their distance from the ellipse is more than so many medians.
+# Edge points are dropped if their distance from the ellipse is more than this many medians.
 _REFITS, _MAX_STRAY = 2, 3.0
 
 _OUTLINE_RAD = CODE_ANGLES_RAD[::5]  # enough points of the outline to undistort it

@@ -39,8 +39,8 @@ _MIN_CONTRAST = 5  # grey values; less is noise
 # on. There are so few peaks of this size that the wider limit costs nothing.
 _MAX_RING_SPREAD, _MAX_LARGE_RING_SPREAD = 0.5, 0.8
 _LARGE_PX = 22.0
-# A surround counts as bright if it is so many times as bright as the ring in the same direction. So
-# it is recognised in shade, where it may be darker than the filter's mean.
+# A surround counts as bright if it is this many times as bright as the ring in the same direction.
+# So it is recognised in shade, where it may be darker than the filter's mean.
 _SHADE_RATIO = 2
 # Largest unevenness, relative to the contrast in shade: the largest of the spreads of core and
 # surround and of their difference. In a linear image, half of it in shade that takes half of the

@@ -31,7 +31,7 @@ PEAK_RADIUS_PX = 2.8
 _UNIT = 225.0 / 4.0  # score per grey value: 225 pixels; only a quarter of it fits into 16 bits
 _MIN_SCORE = np.int16(5.0 * _UNIT)  # 5 grey values; a ring's score is at most half of its contrast
 _MIN_SHARE = np.int16(0.2 * _UNIT)  # relative to the range of grey values around; less is texture
-# Largest number of peaks in an image: so many per pixel, but 1000 in small images.
+# Largest number of peaks in an image: this many per pixel, but 1000 in small images.
 _MAX_PEAK_SHARE, _MAX_PEAKS = 1 / 400, 1000
 
 _REACH = 4  # rows and columns around a pixel on which a peak there depends

@@ -32,7 +32,7 @@ _MAX_NOISE_ROUNDS = 6  # rounds of estimating the noise and rejecting frames wit
 _SETTLED_NOISE = 0.1  # relative change of a standard deviation between two rounds
 # A circle stands apart if its noise is larger than that of the median circle by this factor: it was
 # moved, or something else was taken for it. Errors of poses are similar for all circles. At least
-# so many circles are needed for a median.
+# this many circles are needed for a median.
 _APART_RATIO, _MIN_CIRCLES = 4.0, 3
 # The splits of two circles are the same if at least this share of their common frames are on the
 # same side of both, and if the offsets differ by at most this share of the larger one. The second
@@ -41,7 +41,7 @@ _MIN_SAME_SIDE, _MAX_OFFSET_DIFFERENCE = 0.8, 0.75
 # Largest step of reference poses beyond their stated errors [m]. Without fixed ambiguities they
 # change by decimetres, and half a degree of attitude is 0.26 m at 30 m.
 _MAX_POSE_STEP_M = 0.3
-# One of two circles can stand apart only if each is in at least so many frames. With eight, their
+# One of two circles can stand apart only if each is in at least this many frames. With eight, their
 # variances differ 16-fold by chance once in 70 000 flights.
 _MIN_FRAMES_OF_TWO = 8
 _MAX_FACTOR = 10.0  # largest variance factor that is accepted with the estimated noise

@@ -24,8 +24,8 @@ MAX_STEPS = 40
 
 _CONVERGED = 1e-5  # decrease of χ² at which the iteration ends
 _ROUNDING = 1e-9  # expected decrease of χ² below which no step is tried
-# The curve of likely poses is followed to so many standard deviations on either side. At its ends,
-# χ² must have risen by at least this share of the rise that the covariance predicts.
+# The curve of likely poses is followed to this many standard deviations on either side. At its
+# ends, χ² must have risen by at least this share of the rise that the covariance predicts.
 _CURVE_END_SD, _MIN_RISE = 3.0, 0.5
 _NO_DISTANCE_SD = 1e6  # standard deviation of the logarithm of a distance that is not measured
 _HALF_WEIGHT_CHI2 = 9.0  # χ² of a point that has weight 1/2 in the common errors

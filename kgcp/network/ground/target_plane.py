@@ -56,8 +56,8 @@ single number."""
 MAX_EXTRA_PX = 100.0
 """Largest additional standard deviation that is estimated [px]; if it is reached, nothing fits."""
 
-# Stated variances are scaled down only with at least so many degrees of freedom, and by no smaller
-# factor than this.
+# Stated variances are scaled down only with at least this many degrees of freedom, and by no
+# smaller factor than this.
 _MIN_FREEDOM, _MIN_FACTOR = 200, 0.25
 
 

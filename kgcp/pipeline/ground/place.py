@@ -210,9 +210,9 @@ def _require_fit(placement: Placement, flight: Flight, poses: Path | None) -> No
     if not placement.targets:
         name, reason = next(iter(placement.skipped.items()))
         raise KgcpError(
-            f"{source}: no target can be placed ({name!r}: {reason}); look whether enough frames"
-            " show the targets and have a pose, and whether axes and angles of the poses are of the"
-            " stated kind",
+            f"{source}: no target can be placed ({name!r}: {reason}); check that enough frames"
+            " show the targets and have a pose, and that the poses have the axes and angles that"
+            " are stated",
             option=option,
         )
     if placement.noise.centre_px >= MAX_EXTRA_PX:

@@ -71,7 +71,7 @@ def test_many_files_are_written_or_the_one_that_cannot_be_is_named(tmp_path: Pat
 
 
 class OpenFile:
-    """A file that Windows keeps while a program has it open, for so many attempts."""
+    """A file that Windows keeps while a program has it open, for this many attempts."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, path: Path, attempts: float) -> None:
         self.path, self.attempts = path, attempts

@@ -195,7 +195,7 @@ def test_a_coefficient_contributes_only_the_information_of_its_interval() -> Non
 
 
 def tasks_of(photos: Sequence[GreyArray], most: int | None = None) -> list[list[DiscTask]]:
-    """Return the discs of each photograph, or so many of them at most."""
+    """Return the discs of each photograph, or this many of them at most."""
     return [[DiscTask(photo, each, []) for each in find_outlines(photo)[:most]] for photo in photos]
 
 
