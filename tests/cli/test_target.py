@@ -15,8 +15,8 @@ from kgcp.geometry.camera import Response
 from kgcp.io.flight.field_file import read_field
 from kgcp.io.flight.flight import read_printed_targets
 from kgcp.io.print import write
-from kgcp.measurement.discs.photograph import PhotoDiscs, PhotoTask, measure_field
 from kgcp.measurement.discs.records import Operator
+from kgcp.measurement.field_photograph import PhotoDiscs, PhotoTask, measure_field
 from kgcp.targets.code_design import LEAST_DISTANCE
 from kgcp.targets.fields.layout import Field
 from kgcp.targets.layout import Target

@@ -18,8 +18,8 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Response
 from kgcp.measurement.discs.camera_tone import CameraTone
 from kgcp.measurement.discs.fit_disc import ProcessingPrior
-from kgcp.measurement.discs.photograph import PhotoDiscs, PhotoMiss, PhotoTask
 from kgcp.measurement.discs.records import Operator
+from kgcp.measurement.field_photograph import PhotoDiscs, PhotoMiss, PhotoTask
 from kgcp.measurement.image_model.photometry import Tone
 from kgcp.pipeline.calibration.photographs import Photo
 from kgcp.pipeline.calibration.run import _camera_of, _Looks

@@ -9,8 +9,8 @@ import pytest
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera, Response
-from kgcp.measurement.discs.photograph import PhotoDiscs, PhotoTask, measure_field
 from kgcp.measurement.discs.records import Operator
+from kgcp.measurement.field_photograph import PhotoDiscs, PhotoTask, measure_field
 from kgcp.quality.disc_light import DiscLight, light_on_discs
 from kgcp.simulation.field_session import FieldSession, field_photograph, printed_points
 from kgcp.targets.fields.layout import Field, FieldPolarity, GridKind, Mark

@@ -22,8 +22,8 @@ from kgcp.io.tables.columns import (
     row_of,
     sd_cell,
 )
-from kgcp.measurement.discs.photograph import PhotoDiscs, PhotoMiss
 from kgcp.measurement.discs.records import ellipse_of_moments
+from kgcp.measurement.field_photograph import PhotoDiscs, PhotoMiss
 from kgcp.network.calibration_records import CameraCalibration, PointModel
 
 

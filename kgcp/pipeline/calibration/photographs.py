@@ -16,7 +16,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.io.images.exif import read_frame_header
 from kgcp.io.images.frames import read_grey
 from kgcp.measurement.discs.camera_tone import CameraTone
-from kgcp.measurement.discs.photograph import (
+from kgcp.measurement.field_photograph import (
     PhotoDiscs,
     PhotoMiss,
     PhotoTask,

@@ -21,8 +21,8 @@ from kgcp.io.images.frames import FRAME_SUFFIXES, list_frames
 from kgcp.io.images.remote import stamps_of
 from kgcp.io.tables.provenance import versions
 from kgcp.measurement.discs.camera_tone import CameraTone
-from kgcp.measurement.discs.photograph import PhotoDiscs, PhotoMiss, PhotoTask
 from kgcp.measurement.discs.records import Operator
+from kgcp.measurement.field_photograph import PhotoDiscs, PhotoMiss, PhotoTask
 from kgcp.network.calibration import LEAST_VIEWS, calibrate_camera, missing_discs
 from kgcp.network.calibration_records import (
     CalibrationSettings,

@@ -36,7 +36,7 @@ from kgcp.errors import KgcpError, Reason
 from kgcp.io.files.portable import OPEN_FLAGS, lock
 from kgcp.io.files.safe_read import is_file
 from kgcp.measurement import records
-from kgcp.measurement.discs.photograph import PhotoDiscs, PhotoMiss
+from kgcp.measurement.field_photograph import PhotoDiscs, PhotoMiss
 from kgcp.measurement.records import Considered, FrameResult, Imaging, Miss, TimeSource, ToneBase
 
 # All record types of which a result may consist; `records` also imports those of other modules.

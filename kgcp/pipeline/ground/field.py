@@ -13,13 +13,13 @@ from kgcp.errors import Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.io.flight.flight import Flight
 from kgcp.io.images.frames import list_frames, matching_frames, read_grey
-from kgcp.measurement.discs.photograph import (
+from kgcp.measurement.discs.records import Operator
+from kgcp.measurement.field_photograph import (
     PhotoMiss,
     PhotoTask,
     learn_from_fields,
     measure_field,
 )
-from kgcp.measurement.discs.records import Operator
 from kgcp.network.ground.field_pose import FieldPose, orient_by_field
 from kgcp.network.ground.resection import NoPoseError
 from kgcp.pipeline.calibration.run import LEARNED_FROM, REASONS

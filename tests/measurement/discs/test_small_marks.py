@@ -11,8 +11,8 @@ import pytest
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.measurement.discs.outlines import find_outlines
-from kgcp.measurement.discs.photograph import PhotoDiscs, PhotoTask, measure_field
 from kgcp.measurement.discs.records import Operator
+from kgcp.measurement.field_photograph import PhotoDiscs, PhotoTask, measure_field
 from kgcp.simulation.field_session import FieldPhotograph, FieldSession, field_photograph
 from kgcp.targets.fields.layout import Field, FieldPolarity, GridKind, Mark
 

@@ -7,7 +7,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from kgcp.measurement.discs.photograph import _are_in_one_row
+from kgcp.measurement.field_photograph import _are_in_one_row
 
 
 @pytest.mark.parametrize(("beside", "is_row"), [(0, True), (1, True), (2, False)])
