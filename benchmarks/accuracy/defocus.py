@@ -17,7 +17,7 @@ import click
 
 from benchmarks.accuracy.bands import join_truth, read_truth
 from benchmarks.accuracy.evaluate import detect
-from benchmarks.accuracy.flights import HEADER, line_of
+from benchmarks.accuracy.flights import HEADER, line_of, with_sides
 from kgcp.io.flight.flight import read_flight
 from kgcp.pipeline.execution.resilient_map import usable_cores
 from kgcp.pipeline.simulate import write_simulated_flight
@@ -63,7 +63,8 @@ def main(
                 write_simulated_flight(plan, flight, jobs=workers, on_frame=lambda: None)
                 table = detect(flight, DetectSettings(), workers)
                 table = join_truth(table, read_truth(flight / "truth.csv"))
-                print(line_of(f"{name} {radius_px:g} px", read_flight(flight), table), flush=True)
+                table = with_sides(read_flight(flight), table)
+                print(line_of(f"{name} {radius_px:g} px", table), flush=True)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from benchmarks.accuracy.bands import join_truth, read_truth
 from benchmarks.accuracy.evaluate import detect
-from benchmarks.accuracy.flights import HEADER, line_of, truth_path
+from benchmarks.accuracy.flights import HEADER, line_of, truth_path, with_sides
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.images.frames import list_frames
 from kgcp.pipeline.execution.resilient_map import usable_cores
@@ -148,7 +148,8 @@ def main(flights: tuple[Path, ...], only: tuple[str, ...], jobs: int | None) -> 
                 out = Path(folder) / "flight"
                 process_flight(flight, name, out)
                 found = detect(out, DetectSettings(), jobs or usable_cores())
-                print(line_of(name, read_flight(out), join_truth(found, truth)), flush=True)
+                table = with_sides(read_flight(out), join_truth(found, truth))
+                print(line_of(name, table), flush=True)
 
 
 if __name__ == "__main__":
