@@ -1,10 +1,10 @@
 """Covariance of a disc's centroid and moments, from residuals that may be correlated.
 
 As for coded targets (`adjustment.covariance`), scores are summed over arcs of the edge, and their
-scatter is compared with the one that this fit would leave of independent residuals. A disc has few
-arcs, so that only all discs of a photograph together can show variances below those of independent
-pixels. That happens where JPEG has compressed the photograph in blocks of 8 × 8 pixels: scores are
-summed over these blocks, too.
+scatter is compared with the one that this fit would leave of independent residuals. If a disc is
+adjusted to JPEG's intervals, scores are summed over the blocks of 8 × 8 pixels. A disc has few arcs
+or blocks, so that only all discs of a photograph together can show variances below those of
+independent residuals.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from scipy.special import ndtri
 
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.discs.affine_model import Geometry, mean_radius_px
+from kgcp.measurement.discs.compressed_fit import CompressedFit
 from kgcp.measurement.discs.disc_levels import GEOMETRY_COUNT
 from kgcp.measurement.discs.fit_disc import DiscFit
 from kgcp.measurement.discs.pixel_choice import outward_px
@@ -27,14 +28,12 @@ from kgcp.measurement.image_model.residual_agreement import sums_over_arcs
 
 _ARC_PX = 6.0
 _FEWEST_ARCS = 8
-# JPEG's blocks, and how many of them all discs of a photograph must have
-_BLOCK_PX, _FEWEST_BLOCKS = 8, 40.0
 _ARCS_OF_PHOTOGRAPH = 40.0  # weight, in arcs, of the ratio of all discs against that of one disc
-_LEAST_SCATTER_LEFT, _NEARLY_NONE = 1.0, 1e-6  # least scatter that a fit leaves
+_LEAST_SCATTER_LEFT = 1.0  # least scatter that a fit leaves
 _OUTLYING_RATIO = 3.0  # times the median; larger ratios are those of single discs, and are cut
 _LEAST_FACTOR = 0.25  # of variances, as for coded targets
-# Variances by chance of a ratio of 1: from one arc, from one block, and from one pixel of an edge
-_ARC_VARIANCE, _BLOCK_VARIANCE, _PIXEL_VARIANCE = 2.0, 1.5, 2.5
+# Variances by chance of a ratio of 1: from one arc or block, and from one pixel of an edge
+_ARC_VARIANCE, _PIXEL_VARIANCE = 2.0, 2.5
 # Least standard deviation of centre and edge, whatever the noise. With 0.0005 px, deviations of
 # simulated discs of R 60 px were up to 15 % too large.
 _FLOOR_PX = 0.0002
@@ -71,15 +70,6 @@ _SHARE_LEFT_OF_RING, _LEAST_GAP_PX, _LEAST_GAP = 1.0 / 15.0, 1.9, 3.0
 _BY_CURVE_PER_FALL = 0.05
 
 
-@dataclass(frozen=True, slots=True)
-class BlockScatter:
-    """The scatter of one disc's scores over JPEG's blocks."""
-
-    ratio: float  # mean ratio to the scatter of independent residuals
-    expected: float  # that scatter, after the fit; it is small if there are few blocks
-    count: float  # number of blocks of equal weight that would tell as much
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscScatter:
     """What the residuals of one disc say of its covariance."""
@@ -87,8 +77,7 @@ class DiscScatter:
     independent: FloatArray  # (5, 5): of centroid [px] and moments [px²], for independent residuals
     common: FloatArray  # (5, 5): added for displacements of the whole edge, and the floor
     ratio: float  # mean ratio of the scatter of scores to that of independent residuals
-    arcs: int  # number of arcs that it was found from
-    over_blocks: BlockScatter
+    arcs: float  # number of arcs, or of blocks of equal weight, that it was found from
     is_noise_alone: bool  # whether nothing is clipped, and the light is linear
 
     def cov(self, inflation: float) -> FloatArray:
@@ -96,24 +85,33 @@ class DiscScatter:
         return inflation * self.independent + self.common
 
 
-def scatter_of(fit: DiscFit) -> DiscScatter:
+def scatter_of(fit: DiscFit, compressed: CompressedFit | None = None) -> DiscScatter:
     """Return the parts of the covariance of centroid and second moments.
 
-    The fit must be one that `check_disc_fit` accepts, with enough redundancy.
+    Parameters
+    ----------
+    fit : DiscFit
+        One that `check_disc_fit` accepts, with enough redundancy.
+    compressed : CompressedFit, optional
+        The equations of a fit to intervals, whose state `fit` has.
     """
-    scaled, inverse = fit.scaled, np.linalg.inv(fit.normal).astype(np.float64)
+    misfit, scaled, normal = fit.misfit, fit.scaled, fit.normal
+    if compressed is not None:
+        misfit, scaled, normal = compressed.misfit, compressed.scaled, compressed.normal
+    inverse = np.linalg.inv(normal).astype(np.float64)
     own = inverse[:GEOMETRY_COUNT]
     root = np.linalg.cholesky(own[:, :GEOMETRY_COUNT])
     to_own = np.linalg.solve(root, own)  # in units of N⁻¹
     of_own, of_all = np.ascontiguousarray((to_own @ scaled).T), np.ascontiguousarray(scaled.T)
-    score, weight = fit.misfit.score, fit.misfit.weight
-    sums, products, arcs = sums_over_arcs(of_own, of_all, score, weight, _arcs(fit))
-    ratio = scatter_ratio(sums, products, to_own, inverse)
-    sums, products, _ = sums_over_arcs(of_own, of_all, score, weight, _blocks(fit))
-    expected = max(_scatter_left(products, to_own, inverse), _NEARLY_NONE)
-    shares = np.einsum("bkp,kp->b", products, to_own)
-    equal = float(shares.sum() ** 2 / np.sum(shares * shares))
-    over_blocks = BlockScatter(float(np.sum(sums * sums)) / expected, expected, equal)
+    group = _arcs(fit) if compressed is None else compressed.block
+    sums, products, count = sums_over_arcs(of_own, of_all, misfit.score, misfit.weight, group)
+    ratio, arcs = scatter_ratio(sums, products, to_own, inverse), float(count)
+    # with an estimated noise, errors over deviations are distributed as Student's t
+    freedom = fit.noise_freedom
+    t_variance = freedom / (freedom - 2.0)
+    if compressed is not None:  # the noise is that of all discs, and blocks differ in weight
+        shares, t_variance = np.einsum("bkp,kp->b", products, to_own), 1.0
+        arcs = float(shares.sum() ** 2 / np.sum(shares * shares))
     if _edges_tell_displacement(fit):  # `RingUnknowns` allows for the displacement itself
         common_px = max(_FLOOR_PX, _SHARE_LEFT_OF_RING * _camera_displacement_px(fit))
     else:
@@ -127,15 +125,11 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
     by_curved_light_px = _curved_light_displacement_px(fit)
     common[:2, :2] += by_curved_light_px @ by_curved_light_px
     to_moments = moments_by_stretch(fit.state.geometry)
-    # with an estimated noise, errors over deviations are distributed as Student's t
-    freedom = fit.noise_freedom
-    t_variance = freedom / (freedom - 2.0)
     return DiscScatter(
         t_variance * (to_moments @ own[:, :GEOMETRY_COUNT] @ to_moments.T),
         to_moments @ common @ to_moments.T,
         ratio,
         arcs,
-        over_blocks,
         not (fit.sample.is_burnt or fit.free.is_light_curved),
     )
 
@@ -144,6 +138,9 @@ def scatter_ratio(
     sums: FloatArray, products: FloatArray, to_own: FloatArray, inverse: FloatArray
 ) -> float:
     """Return the scatter of the arcs' scores relative to that of independent residuals.
+
+    On an arc whose normal matrix is A, a fit leaves A − A N⁻¹ A of the scatter of independent
+    residuals.
 
     Parameters
     ----------
@@ -156,16 +153,8 @@ def scatter_ratio(
     inverse : (p, p) array
         N⁻¹, of all arcs and the priors.
     """
-    scatter_left = _scatter_left(products, to_own, inverse)
-    return float(np.sum(sums * sums)) / max(scatter_left, _LEAST_SCATTER_LEFT)
-
-
-def _scatter_left(products: FloatArray, to_own: FloatArray, inverse: FloatArray) -> float:
-    """Return the scatter of scores that a fit leaves of independent residuals.
-
-    On an arc whose normal matrix is A, a fit leaves A − A N⁻¹ A.
-    """
-    return float(np.sum(products.sum(axis=0) * to_own) - np.sum((products @ inverse) * products))
+    scatter_left = np.sum(products.sum(axis=0) * to_own) - np.sum((products @ inverse) * products)
+    return float(np.sum(sums * sums)) / max(float(scatter_left), _LEAST_SCATTER_LEFT)
 
 
 def inflations(scatters: Sequence[DiscScatter]) -> FloatArray:
@@ -188,7 +177,6 @@ def inflations(scatters: Sequence[DiscScatter]) -> FloatArray:
     is_noise_alone = np.array([each.is_noise_alone for each in scatters])
     ratios = np.array([each.ratio for each in scatters])
     arcs = np.array([each.arcs for each in scatters], dtype=np.float64)
-    ratios[is_noise_alone] *= _blocks_over_arcs([each for each in scatters if each.is_noise_alone])
     of_photograph = _typical(ratios)
     chance = np.array(_ARC_VARIANCE / arcs.sum())
     shown = max(1.0 - float(beyond_chance(np.array(1.0 - of_photograph), chance)), _LEAST_FACTOR)
@@ -199,28 +187,9 @@ def inflations(scatters: Sequence[DiscScatter]) -> FloatArray:
     return least + beyond_chance(pooled - least, _ARC_VARIANCE * (arcs + shared) / weight**2)
 
 
-def _blocks_over_arcs(scatters: Sequence[DiscScatter]) -> float:
-    """Return the ratio over JPEG's blocks divided by that over arcs; at most 1.
-
-    Errors of compression cancel each other over a block, and less so over arcs of edges, which do
-    not follow the blocks' borders. It is 1 without compression, and if the discs are too few to
-    tell.
-    """
-    blocks = [each.over_blocks for each in scatters]
-    count = sum(each.count for each in blocks)
-    if count < _FEWEST_BLOCKS:
-        return 1.0
-    weights = np.array([each.expected for each in blocks])
-    over_blocks = _typical(np.array([each.ratio for each in blocks]), weights)
-    over_arcs = _typical(np.array([each.ratio for each in scatters]))
-    chance = np.array(_BLOCK_VARIANCE / count)
-    return 1.0 - float(beyond_chance(np.array(1.0 - over_blocks / over_arcs), chance))
-
-
-def _typical(ratios: FloatArray, weights: FloatArray | None = None) -> float:
+def _typical(ratios: FloatArray) -> float:
     """Return the mean of ratios (n,), with those of single discs that are far above it cut."""
-    usual = np.minimum(ratios, _OUTLYING_RATIO * np.median(ratios))
-    return float(np.average(usual, weights=weights))
+    return float(np.mean(np.minimum(ratios, _OUTLYING_RATIO * np.median(ratios))))
 
 
 def beyond_chance(excess: FloatArray, variance: FloatArray) -> FloatArray:
@@ -316,10 +285,3 @@ def _arcs(fit: DiscFit) -> IndexArray:
     count = max(round(length_px / _ARC_PX), _FEWEST_ARCS)
     turn = np.arctan2(v, u) / (2.0 * np.pi) % 1.0
     return np.asarray(np.minimum((turn * count).astype(np.intp), count - 1))
-
-
-def _blocks(fit: DiscFit) -> IndexArray:
-    """Return the number (n,) of every pixel's JPEG block, if the photograph was not cropped."""
-    columns, rows = fit.sample.pixels.places_px.astype(np.intp) // _BLOCK_PX
-    numbers = rows * (fit.sample.window.frame_px // _BLOCK_PX + 1) + columns
-    return np.unique(numbers, return_inverse=True)[1]

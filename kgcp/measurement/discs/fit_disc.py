@@ -568,7 +568,7 @@ def _minimise(
     fit, damping = disc_fit_at(sample, state, free, sd, linear), _DAMPING
     total = fit.misfit.total + free.penalty(fit.state.vector)
     for _ in range(_STEPS):
-        step, promised = _step(fit, damping)
+        step, promised = newton_step(fit, damping)
         if promised < _LEAST_PROMISE:
             break
         trial = disc_fit_at(sample, fit.state.moved(step, free.tone), free, sd)
@@ -582,7 +582,7 @@ def _minimise(
     return fit
 
 
-def _step(fit: DiscFit, damping: float) -> tuple[FloatArray, float]:
+def newton_step(fit: DiscFit, damping: float) -> tuple[FloatArray, float]:
     """Return a step (21,) and the gain that it promises."""
     free = fit.free
     gradient = fit.gradient

@@ -13,8 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
-from kgcp.measurement.adjustment.normal_equations import weighted_products
 from kgcp.measurement.discs.affine_model import mean_radius_px
+from kgcp.measurement.discs.compressed_fit import (
+    compressed_fit_at,
+    noise_before_compression,
+    pixels_before_compression,
+)
 from kgcp.measurement.discs.disc_levels import COUNT
 from kgcp.measurement.discs.fit_disc import (
     CAMERA_ROWS,
@@ -24,13 +28,11 @@ from kgcp.measurement.discs.fit_disc import (
     DiscUnknowns,
     NoFit,
     ProcessingPrior,
-    disc_fit_at,
     misfit_by,
     noise_at,
 )
 from kgcp.measurement.discs.tone_curve import WAVES, wave_limits
 from kgcp.measurement.image_model.compression import CompressedPixels
-from kgcp.measurement.image_model.noise import Misfit, misfit
 from kgcp.measurement.image_model.photometry import Tone
 
 _STEPS, _NOISE_ROUNDS = 25, 2
@@ -132,7 +134,10 @@ def adjust_before_compression(
         If the equations cannot be solved.
     """
     free, usual = _unknowns(tone, sharpening_px), ProcessingPrior.usual()
-    pixels = [pixels_before_compression(*pair) for pair in zip(samples, steps, strict=True)]
+    pixels = [
+        None if of_photograph is None else pixels_before_compression(sample, of_photograph)
+        for sample, of_photograph in zip(samples, steps, strict=True)
+    ]
     if sds is not None:
         fits = _minimised(samples, states, free, usual, sds, pixels)
         return _joint(fits, sharpening_px, _total(fits, usual), is_settled=True)
@@ -152,66 +157,6 @@ def adjust_before_compression(
         if is_settled:
             break
     return _joint(fits, sharpening_px, _total(fits, usual), is_settled=is_settled)
-
-
-def pixels_before_compression(
-    sample: DiscSample, steps: FloatArray | None
-) -> CompressedPixels | None:
-    """Return what compression left of a disc's pixels; None where there was none.
-
-    Parameters
-    ----------
-    steps : (8, 8) array
-        Of its photograph, by `quantisation_steps`; None: it was not compressed.
-    """
-    if steps is None:
-        return None
-    return CompressedPixels.of(sample.window.photo, sample.pixels.places_px, steps)
-
-
-def compressed_fit_at(
-    sample: DiscSample,
-    state: DiscState,
-    free: DiscUnknowns,
-    sd: FloatArray,
-    pixels: CompressedPixels | None,
-) -> DiscFit:
-    """Return a fit linearised at a state, with the noise (n,) before compression.
-
-    Misfit and scaled Jacobian are those of the coefficients, followed by those of pixels whose
-    block is clipped or not whole.
-    """
-    fit = disc_fit_at(sample, state, free, sd)
-    if pixels is None:
-        return fit
-    alone, clips = pixels.outside_blocks, sample.censoring
-    clips = replace(clips, at_high=clips.at_high[alone], at_low=clips.at_low[alone])
-    of_blocks = pixels.misfit(fit.levels, sd)
-    of_alone = misfit(sample.levels[alone], fit.levels[alone], sd[alone], clips)
-    both = Misfit(
-        of_blocks.total + of_alone.total,
-        np.concatenate((of_blocks.score, of_alone.score)),
-        np.concatenate((of_blocks.weight, of_alone.weight)),
-    )
-    rows = fit.jacobian[free.rows]
-    by_coefficients = pixels.coefficients(rows) / pixels.deviations(sd)
-    scaled = np.hstack((by_coefficients, rows[:, alone] / sd[alone]))
-    normal = weighted_products(scaled, both.weight, np.zeros(len(free.rows)))
-    normal += free.precision[np.ix_(free.rows, free.rows)]
-    return replace(fit, misfit=both, scaled=scaled, normal=normal)
-
-
-def noise_before_compression(fit: DiscFit, pixels: CompressedPixels | None) -> FloatArray:
-    """Return the noise (n,) as level that the pixels of a fit had before compression.
-
-    It is the noise of the expected values before compression, plus their variance (Dempster, Laird
-    & Rubin, "Maximum likelihood from incomplete data via the EM algorithm", 1977).
-    """
-    if pixels is None:
-        return noise_at(fit.sample, fit.state).sd
-    levels, variance = pixels.levels_before(fit.sample.levels, fit.levels, fit.sd)
-    sd = noise_at(replace(fit.sample, levels=levels), fit.state).sd
-    return np.asarray(np.sqrt(sd**2 + variance))
 
 
 def _unknowns(tone: Tone, sharpening_px: float) -> DiscUnknowns:

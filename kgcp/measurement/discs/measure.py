@@ -26,6 +26,7 @@ from kgcp.measurement.discs.camera_tone import (
     unknowns_of_disc,
 )
 from kgcp.measurement.discs.comparison import measure_by_centroid, measure_by_gaussian
+from kgcp.measurement.discs.compressed_fit import adjust_to_intervals
 from kgcp.measurement.discs.covariance import (
     DiscScatter,
     inflations,
@@ -45,6 +46,7 @@ from kgcp.measurement.discs.records import (
 )
 from kgcp.measurement.discs.ring_unknowns import RingUnknowns
 from kgcp.measurement.discs.textured_ground import fit_on_texture
+from kgcp.measurement.image_model.compression import quantisation_steps
 
 _LARGEST_SD_PX = 1.0  # of the centre, and of the moments divided by the radius
 # A disc's window reaches no farther beyond its outline than the smaller of these
@@ -77,7 +79,9 @@ def measure_discs(
         How far the bare ground around a disc reaches from its middle, in radii, if a ring of code
         follows.
     """
-    return _measured(_tasks(grey, outlines, ground), response, operator, camera)
+    tasks = _tasks(grey, outlines, ground)
+    steps = quantisation_steps(grey) if operator is Operator.MODEL and tasks else None
+    return _measured(tasks, response, operator, camera, steps)
 
 
 def learn_camera(
@@ -141,13 +145,20 @@ def _tasks(grey: GreyArray, outlines: Sequence[DiscOutline], ground: float) -> l
 
 
 def _measured(
-    tasks: Sequence[DiscTask], response: Response, operator: Operator, camera: CameraTone | None
+    tasks: Sequence[DiscTask],
+    response: Response,
+    operator: Operator,
+    camera: CameraTone | None,
+    steps: FloatArray | None = None,
 ) -> list[Disc | DiscMiss]:
+    """Measure discs; `steps` (8, 8): with which their photograph was compressed, if it was."""
     if operator is not Operator.MODEL:
         measure = measure_by_centroid if operator is Operator.CENTROID else measure_by_gaussian
         return [_refuse_uncertain(measure(task)) for task in tasks]
     camera = learn_tone([tasks], response) if camera is None else camera
     outcomes = [_fitted(task, camera) for task in tasks]
+    if steps is not None:
+        outcomes = _before_compression(outcomes, steps)
     fits = [each for each in outcomes if not isinstance(each, DiscMiss)]
     factors = iter(inflations([scatter for _, scatter in fits]).tolist())
     return [
@@ -172,6 +183,28 @@ def _fitted(task: DiscTask, camera: CameraTone) -> tuple[DiscFit, DiscScatter] |
         return DiscMiss(task.outline, rejection.reason, rejection.detail)
     except (NoFit, np.linalg.LinAlgError):
         return DiscMiss(task.outline, DiscReason.POOR_FIT, "singular equations")
+
+
+def _before_compression(
+    outcomes: list[tuple[DiscFit, DiscScatter] | DiscMiss], steps: FloatArray
+) -> list[tuple[DiscFit, DiscScatter] | DiscMiss]:
+    """Return the outcomes, with discs adjusted to the intervals of rounded coefficients.
+
+    Burnt discs stay as they are: blocks with clipped pixels have no exact coefficients.
+    """
+    measured = {
+        index: each[0]
+        for index, each in enumerate(outcomes)
+        if not isinstance(each, DiscMiss) and not each[0].sample.is_burnt
+    }
+    if not measured:
+        return outcomes
+    adjusted = list(outcomes)
+    refined = adjust_to_intervals(list(measured.values()), steps)
+    for index, compressed in zip(measured, refined, strict=True):
+        if compressed is not None:
+            adjusted[index] = (compressed.fit, scatter_of(compressed.fit, compressed))
+    return adjusted
 
 
 def _with_ring_unknowns(fit: DiscFit) -> tuple[DiscFit, DiscScatter]:

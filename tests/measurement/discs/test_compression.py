@@ -17,13 +17,10 @@ from kgcp.geometry.pose import Pose
 from kgcp.measurement.discs import joint_tone
 from kgcp.measurement.discs.adjust_disc import DiscTask, adjust_disc
 from kgcp.measurement.discs.camera_tone import learn_tone
+from kgcp.measurement.discs.compressed_fit import compressed_fit_at, pixels_before_compression
 from kgcp.measurement.discs.disc_levels import Row
 from kgcp.measurement.discs.fit_disc import DiscFit, DiscState, DiscUnknowns, NoFit
-from kgcp.measurement.discs.joint_tone import (
-    compressed_fit_at,
-    pixels_before_compression,
-    within_limits,
-)
+from kgcp.measurement.discs.joint_tone import within_limits
 from kgcp.measurement.discs.measure import measure_discs
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.discs.records import Disc
@@ -160,7 +157,6 @@ def test_the_likelihood_of_coefficients_agrees_with_its_derivatives() -> None:
     ]
     fit = fits[int(np.argmax([len(each) for each in alone]))]
     pixels = pixels_before_compression(fit.sample, steps)
-    assert pixels is not None
     assert len(pixels.outside_blocks) > 0
     for row, step in ((0, 1e-5), (2, 1e-5), (int(Row.WHITE), 1e-6), (int(Row.SHARPENING), 1e-5)):
         moved = np.zeros(len(fit.state.vector))
