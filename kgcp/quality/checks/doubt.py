@@ -75,6 +75,10 @@ class Cause(StrEnum):
     )
     LEVER_ARM = "lever_arm", "an axis of the lever arm is wrong, or several targets share it"
     MOUNT = "mount_deg", "the plate is mounted in another direction than mount_deg says"
+    STRETCH = (
+        "stretch",
+        "the print, or the images, are stretched in one direction: circles are not round",
+    )
     HEIGHTS = "heights", "heights are of another kind: above the geoid, or above ground"
     CLOCK = "clock", "times are of another clock, off by leap seconds, hours, days or GPS weeks"
     NO_OVERLAP = "no_overlap", "the times of frames and trajectory do not overlap"

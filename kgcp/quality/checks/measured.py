@@ -19,6 +19,7 @@ from kgcp.quality.checks.frame_header import FrameHeader
 from kgcp.quality.checks.mount import check_mount
 from kgcp.quality.checks.patterns import check_lone_frames, unexplained
 from kgcp.quality.checks.static_targets import check_static_targets
+from kgcp.quality.checks.stretch import check_stretch
 from kgcp.quality.consistency import Consistency
 
 
@@ -62,6 +63,7 @@ def _of_encounters(encounters: Encounters, consistency: Consistency | None) -> I
         yield from causes
         return
     yield from check_mount(encounters)
+    yield from check_stretch(encounters)
     yield from check_lone_frames(encounters)
     if consistency is not None and is_correctable:
         for sentence, remedy in corrections(consistency):

@@ -1,0 +1,126 @@
+"""The check for prints and images that are stretched in one direction."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.pose import rotation_about
+from kgcp.georef.camera_priors import body_from_plate
+from kgcp.quality.checks.doubt import Cause
+from kgcp.quality.checks.encounters import Encounters
+from kgcp.quality.checks.measured import _of_encounters
+from kgcp.quality.checks.stretch import check_stretch
+from tests.quality.checks.test_slips import of
+from tests.wrong_flights.flights import CAMERA
+
+_MOUNT_TILT = np.array([0.03, -0.02, 0.0])  # of the plate on the vehicle [rad]
+_SHARE = 0.002
+_SD_DEG = 0.02
+
+
+@pytest.fixture(scope="module")
+def encounters(tmp_path_factory: pytest.TempPathFactory) -> Encounters:
+    """Those of the sample flight."""
+    return of(tmp_path_factory.mktemp("right") / "flight", CAMERA)
+
+
+def stretched(direction_deg: float) -> FloatArray:
+    """Return a stretch (2, 2): one diameter is longer by `_SHARE` than the one across."""
+    twice = np.radians(2.0 * direction_deg)
+    cosine, sine = np.cos(twice), np.sin(twice)
+    return np.eye(2) + 0.5 * _SHARE * np.array([[cosine, sine], [sine, -cosine]])
+
+
+def seen_as(encounters: Encounters, *, plate: FloatArray, image: FloatArray) -> Encounters:
+    """Return the encounters with the poses of round circles that look like stretched ones.
+
+    They have random errors of `_SD_DEG` about each axis. The views are orthogonal projections along
+    the ray. Such a view of plate axes x, y gives their third components, along the ray, but for the
+    sign: those that are nearer to the truth are taken.
+    """
+    body = np.swapaxes(encounters.enu_from_camera, 1, 2) @ encounters.frame_from_body
+    true = body @ rotation_about(_MOUNT_TILT) @ body_from_plate(0.0)
+    rotations = []
+    rng = np.random.default_rng(1)
+    for rotation, centre in zip(true, encounters.in_camera_m, strict=True):
+        ray = centre / np.linalg.norm(centre)
+        x = np.array([1.0, 0.0, 0.0]) - ray[0] * ray
+        x /= np.linalg.norm(x)
+        axes = np.stack((x, np.cross(ray, x), ray))
+        view = image @ (axes @ rotation)[:2, :2] @ plate
+        view /= np.linalg.norm(view, 2)  # the longest diameter is that of the circle
+        _, lengths, right = np.linalg.svd(view)
+        along = np.sqrt(max(0.0, 1.0 - lengths[1] ** 2)) * right[1]
+        if along @ (axes @ rotation)[2, :2] < 0.0:
+            along = -along
+        columns = axes.T @ np.vstack((view, along))
+        error = rotation_about(np.radians(_SD_DEG) * rng.standard_normal(3))
+        rotations.append(error @ np.column_stack((columns, np.cross(*columns.T))))
+    return replace(encounters, camera_from_plate=np.array(rotations))
+
+
+def test_a_round_print_on_a_tilted_plate_is_not_in_doubt(encounters: Encounters) -> None:
+    assert not [*check_stretch(encounters)]
+    assert not [*check_stretch(seen_as(encounters, plate=np.eye(2), image=np.eye(2)))]
+
+
+@pytest.mark.parametrize("direction_deg", [20.0, 110.0])
+def test_a_stretched_print_is_recognised(encounters: Encounters, direction_deg: float) -> None:
+    """Every pose fits its frame, and the positions of vehicle and camera agree."""
+    seen = seen_as(encounters, plate=stretched(direction_deg), image=np.eye(2))
+    (doubt,) = _of_encounters(seen, None)
+    assert doubt.code is Cause.STRETCH
+    assert doubt.figures["stretch"] == pytest.approx(_SHARE, rel=0.03)
+    (found,) = re.findall(r"the print was stretched by .* along (\d+)°", doubt.sentence)
+    assert float(found) == pytest.approx(direction_deg, abs=3.0)
+    assert "images" not in doubt.sentence
+    assert "diameter in several directions" in doubt.remedy
+
+
+@pytest.mark.parametrize("direction_deg", [0.0, 135.0])
+def test_stretched_images_are_recognised(encounters: Encounters, direction_deg: float) -> None:
+    seen = seen_as(encounters, plate=np.eye(2), image=stretched(direction_deg))
+    (doubt,) = check_stretch(seen)
+    assert doubt.figures["stretch"] == pytest.approx(_SHARE, rel=0.05)
+    (found,) = re.findall(r"the images were stretched by .* along (\d+)°", doubt.sentence)
+    assert abs((float(found) - direction_deg + 90.0) % 180.0 - 90.0) < 3.0
+    assert "print" not in doubt.sentence
+    assert "fx, fy and readout_s" in doubt.remedy
+
+
+def test_images_under_a_rolling_shutter_are_not_tested(encounters: Encounters) -> None:
+    seen = seen_as(encounters, plate=np.eye(2), image=stretched(0.0))
+    rolling = replace(encounters.camera, readout_s=0.02)
+    assert not [*check_stretch(replace(seen, camera=rolling))]
+
+
+def test_a_camera_that_never_turns_cannot_tell_print_from_images(encounters: Encounters) -> None:
+    """If the plate always has the same heading in the image, both explain the same."""
+    fixed = replace(encounters, enu_from_camera=encounters.frame_from_body @ body_from_plate(0.0))
+    (doubt,) = check_stretch(seen_as(fixed, plate=stretched(0.0), image=np.eye(2)))
+    assert " or the " in doubt.sentence
+    assert "diameter in several directions" in doubt.remedy
+    assert "fx, fy and readout_s" in doubt.remedy
+
+
+def test_few_frames_are_not_tested(encounters: Encounters) -> None:
+    seen = seen_as(encounters, plate=stretched(0.0), image=np.eye(2))
+    position = seen.position_m.copy()
+    position[7:] = np.nan  # outside the trajectory
+    assert not [*check_stretch(replace(seen, position_m=position))]
+
+
+def test_equal_views_are_not_tested(encounters: Encounters) -> None:
+    """A tilt of the plate and a stretch have the same effect then."""
+    body = encounters.frame_from_body
+    alike = replace(
+        encounters,
+        enu_from_camera=body @ body_from_plate(30.0),
+        in_camera_m=np.broadcast_to([1.0, 2.0, 9.0], encounters.in_camera_m.shape),
+    )
+    assert not [*check_stretch(seen_as(alike, plate=stretched(0.0), image=np.eye(2)))]
