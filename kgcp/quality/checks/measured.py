@@ -63,7 +63,10 @@ def _of_encounters(encounters: Encounters, consistency: Consistency | None) -> I
         yield from causes
         return
     yield from check_mount(encounters)
-    yield from check_stretch(encounters)
+    stretch = tuple(check_stretch(encounters))
+    if stretch:  # corrections would compensate for it in part, and so be wrong
+        yield from stretch
+        return
     yield from check_lone_frames(encounters)
     if consistency is not None and is_correctable:
         for sentence, remedy in corrections(consistency):

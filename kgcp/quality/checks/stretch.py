@@ -34,8 +34,8 @@ _STRETCHES: FloatArray = 0.5 * np.array([[[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0],
 _PRINT, _IMAGES = "the print was", "the images were"
 _DIRECTIONS = {_PRINT: "of the plate, as code_deg counts", _IMAGES: "from x towards y"}
 _REMEDIES = {
-    _PRINT: "measure the ring's outer diameter in several directions, and print the target again if"
-    " it is not round",
+    _PRINT: "measure the ring's outer diameter in several directions, look for joints that do not"
+    " fit, and print the target again if the ring is not round",
     _IMAGES: "check fx, fy and readout_s in [camera], and that no program has resized the frames",
 }
 
