@@ -13,7 +13,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.georef.local_frame import CrsTransform
-from kgcp.georef.sighting import Sighting
+from kgcp.georef.sighting import Sighting, unmistakable
 from kgcp.georef.target_positions import NoPosition, TargetPosition, TargetPositions
 
 _SAME_POSITION_RTOL = 1e-9  # corresponds to some millimetres in a northing
@@ -138,16 +138,17 @@ def build_gcps(
     KgcpError
         As `TargetPositions.positions`, or as `check_ids`.
     """
-    first = [sighting for sighting in sightings if sighting.instance == 0]
-    times = [sighting.row_time_s(camera) for sighting in first]
-    positions = target_positions.positions([sighting.target for sighting in first], times)
+    single = unmistakable(sightings)
+    times = [sighting.row_time_s(camera) for sighting in single]
+    positions = target_positions.positions([sighting.target for sighting in single], times)
+    usable = {(sighting.frame, sighting.target) for sighting in single}
     skipped = [
         SkippedSighting(sighting.frame, sighting.target, SkipReason.SECOND_PLATE)
         for sighting in sightings
-        if sighting.instance > 0
+        if (sighting.frame, sighting.target) not in usable
     ]
     placed = []
-    for sighting, time_s, position in zip(first, times, positions, strict=True):
+    for sighting, time_s, position in zip(single, times, positions, strict=True):
         if isinstance(position, TargetPosition):
             placed.append((sighting, time_s, position))
         else:

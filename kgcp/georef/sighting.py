@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from kgcp.geometry.arrays import FloatArray
@@ -89,6 +90,16 @@ def sighting_of(
         common_pose_cov=None if common is None else common.pose_cov,
         image=measurement.image,
     )
+
+
+def unmistakable(sightings: Sequence[Sighting]) -> list[Sighting]:
+    """Return the sightings in frames that show one plate with the target's code.
+
+    If there are several, the frame does not tell which is the target: the best score may be that of
+    another vehicle's plate, or of a spare one.
+    """
+    several = {(each.frame, each.target) for each in sightings if each.instance}
+    return [each for each in sightings if (each.frame, each.target) not in several]
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.camera import Camera
 from kgcp.georef.exterior_orientation import ExteriorOrientations
-from kgcp.georef.sighting import Sighting
+from kgcp.georef.sighting import Sighting, unmistakable
 from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.quality.consistency_equations import ComparedFrame, ConsistencyEquations
 from kgcp.quality.corrections import UNKNOWN_LIMITS, CorrectionEstimate, estimate_corrections
@@ -149,10 +149,8 @@ def _compared_frames(
     rows = {frame: row for row, frame in enumerate(poses.frames)}
     moving = [
         sighting
-        for sighting in sightings
-        if not sighting.instance
-        and sighting.target not in target_positions.static
-        and sighting.frame in rows
+        for sighting in unmistakable(sightings)
+        if sighting.target not in target_positions.static and sighting.frame in rows
     ]
     if not moving:
         return []

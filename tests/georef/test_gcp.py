@@ -74,20 +74,30 @@ def test_covariance_is_given_along_the_maps_axes() -> None:
     np.testing.assert_allclose(gcps[0].cov_m2, 0.02**2 * np.eye(3), atol=1e-12)
 
 
-def test_frames_outside_and_second_plates_are_skipped_and_counted() -> None:
-    sightings = [
-        _sighting(1, "A", -5.0),
-        _sighting(2, "A", 5.0),
-        _sighting(2, "A", 5.0, instance=1),
-        _sighting(3, "A", None),
-    ]
+def test_frames_outside_the_trajectory_are_skipped_and_counted() -> None:
+    sightings = [_sighting(1, "A", -5.0), _sighting(2, "A", 5.0), _sighting(3, "A", None)]
     gcps, skipped = build_gcps(sightings, _whereabouts(VehicleSettings()), _CAMERA)
     assert [point.id for point in gcps] == ["K0002"]
     assert set(skipped) == {
         SkippedSighting("f_0001.png", "A", NoPosition.BEFORE_TRAJECTORY),
-        SkippedSighting("f_0002.png", "A", SkipReason.SECOND_PLATE),
         SkippedSighting("f_0003.png", "A", NoPosition.NO_TIME),
     }
+
+
+def test_a_frame_with_two_plates_of_one_code_makes_no_point() -> None:
+    """The better score may be that of another vehicle's plate."""
+    sightings = [
+        _sighting(1, "A", 5.0),
+        _sighting(2, "A", 6.0),
+        _sighting(2, "A", 6.0, instance=1),
+        _sighting(2, "B", 6.0),
+    ]
+    gcps, skipped = build_gcps(sightings, _whereabouts(VehicleSettings(), static="B"), _CAMERA)
+    assert [(point.frame, point.target) for point in gcps] == [
+        ("f_0001.png", "A"),
+        ("f_0002.png", "B"),
+    ]
+    assert skipped == (SkippedSighting("f_0002.png", "A", SkipReason.SECOND_PLATE),) * 2
 
 
 def test_no_sightings_make_no_points() -> None:

@@ -15,7 +15,7 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.camera import Camera
 from kgcp.georef.exterior_orientation import ExteriorOrientations
-from kgcp.georef.sighting import Sighting
+from kgcp.georef.sighting import Sighting, unmistakable
 from kgcp.georef.target_positions import TargetPositions, Vehicle
 from kgcp.georef.trajectory import (
     ENU_FROM_NED,
@@ -69,9 +69,8 @@ class Encounters:
         rows = {frame: row for row, frame in enumerate(poses.frames)}
         posed = [
             (row_s, sighting, sighting.pose, rows[sighting.frame])
-            for sighting in sightings
-            if not sighting.instance
-            and sighting.pose is not None
+            for sighting in unmistakable(sightings)
+            if sighting.pose is not None
             and sighting.target not in target_positions.static
             and sighting.frame in rows
             and (row_s := sighting.row_time_s(camera)) is not None

@@ -102,8 +102,8 @@ def check_lone_frames(encounters: Encounters) -> Iterator[Doubt]:
         Cause.SINGLE_FRAMES,
         f"in {count} of {total} frames vehicle and camera put the target up to {worst:.1f} m"
         f" apart, in the others {encounters.apart_m:.2f} m (median)",
-        "check the times of these frames and their reference poses: consistency.parquet names"
-        " them as outliers",
+        "check the times of these frames and their reference poses, and look for other plates with"
+        " the same code: consistency.parquet names the frames as outliers",
         {"frames": float(count), "worst_m": worst},
     )
 
