@@ -18,7 +18,7 @@ from kgcp.quality.checks.doubt import Cause, Doubt, mild
 from kgcp.quality.checks.encounters import Encounters
 from kgcp.quality.number_text import amount
 
-_MIN_FRAMES = 8
+_MIN_FRAMES = 12  # with 10, robust standard deviations are sometimes too small by far
 _MIN_STRETCH = 5e-4  # distances are wrong by up to half of it
 _MIN_RATIO = 5.0  # of a stretch to its standard deviation
 _ALIKE = 1.5  # ratio of scatters up to which two explanations fit equally well

@@ -111,7 +111,7 @@ def test_a_camera_that_never_turns_cannot_tell_print_from_images(encounters: Enc
 def test_few_frames_are_not_tested(encounters: Encounters) -> None:
     seen = seen_as(encounters, plate=stretched(0.0), image=np.eye(2))
     position = seen.position_m.copy()
-    position[7:] = np.nan  # outside the trajectory
+    position[11:] = np.nan  # outside the trajectory
     assert not [*check_stretch(replace(seen, position_m=position))]
 
 
