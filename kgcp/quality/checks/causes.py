@@ -17,7 +17,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.crs import geoid_height_m
 from kgcp.quality.checks.doubt import Cause, Doubt, grave
 from kgcp.quality.checks.encounters import Encounters, misfit_of
-from kgcp.quality.checks.slips import Slip, clock_slip, remeasured, slips
+from kgcp.quality.checks.slips import Slip, clock_slip, remeasured, slips, without_distortion
 
 MISFIT = 4.0
 """Median square of offsets over their variance above which a cause is looked for."""
@@ -31,6 +31,7 @@ _SCAN_S, _SCAN_STEP_S = 120.0, 0.25  # of shifts of the clock
 _MIN_COVERED_SHARE = 0.6  # of the frames, that must be within the trajectory after a shift
 _FAR_M = 1e7  # stands for an infinite offset
 _MIN_SHIFT_S = 0.3
+_MAX_K1 = 0.5
 _MIN_SCALE_ERROR = 0.01
 _GEOID_TOLERANCE_M = 2.0
 _MIN_GEOID_M = 3.0  # least difference of heights that may be that of geoid and ellipsoid
@@ -134,6 +135,7 @@ def _fitted(encounters: Encounters) -> list[_Trial]:
         _heights(encounters),
         *_clock(encounters),
         *_scales(encounters),
+        *_distortion(encounters),
         _principal_point(encounters),
         _lever_arm(encounters),
         _position(encounters),
@@ -221,6 +223,27 @@ def _scales(encounters: Encounters) -> list[_Trial]:
         ),
     )
     return [_trial((slip,), encounters) for slip in trials]
+
+
+def _distortion(encounters: Encounters) -> list[_Trial]:
+    """Give a camera without distortion the first coefficient."""
+    camera = encounters.camera
+    if camera != without_distortion(camera):
+        return []
+
+    def misfit(k1: float) -> float:
+        return min(remeasured(encounters, replace(camera, k1=k1)).misfit, encounters.misfit)
+
+    k1 = float(minimize_scalar(misfit, bounds=(-_MAX_K1, _MAX_K1), method="bounded").x)
+    slip = Slip(
+        Cause.DISTORTION,
+        "camera",
+        "distances and directions seem to be those of a lens with distortion, but the camera has"
+        " none",
+        f"calibrate the camera; if only k1 is given, {k1:.3f} fits best",
+        lambda other: remeasured(other, replace(camera, k1=k1)),
+    )
+    return [_trial((slip,), encounters)]
 
 
 def _principal_point(encounters: Encounters) -> _Trial:

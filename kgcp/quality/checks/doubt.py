@@ -48,6 +48,10 @@ class Cause(StrEnum):
     )
     GUESSED_CAMERA = "guessed_camera", "the camera is a guess from EXIF, not a calibration"
     DISTORTION_SIGN = "distortion_sign", "k1, k2 … have the sign of another distortion model"
+    DISTORTION = (
+        "distortion",
+        "the frames are rectified and the camera is not, or the camera's distortion is left out",
+    )
     DIAMETERS = (
         "diameters",
         "diameters are radii, or in millimetres, inches or feet",

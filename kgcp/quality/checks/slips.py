@@ -181,6 +181,15 @@ def _of_camera(camera: Camera) -> Iterator[Slip]:
             "give OpenCV's k1, or name the calibration's own file in [camera] file",
             _with_camera(first),
         )
+    rectified = without_distortion(camera)
+    if camera != rectified:
+        yield Slip(
+            Cause.DISTORTION,
+            "camera",
+            "the frames seem to be rectified, but the camera has distortion",
+            "give the raw frames, or the camera of the rectified ones in [camera]",
+            _with_camera(rectified),
+        )
     mirrored = {
         "x and y": {"cx": camera.width - 1 - camera.cx, "cy": camera.height - 1 - camera.cy},
         "y": {"cx": camera.cx, "cy": camera.height - 1 - camera.cy},
@@ -194,6 +203,11 @@ def _of_camera(camera: Camera) -> Iterator[Slip]:
             f"try cx = {point['cx']:.6g}, cy = {point['cy']:.6g}",
             _with_camera(replace(camera, cx=point["cx"], cy=point["cy"])),
         )
+
+
+def without_distortion(camera: Camera) -> Camera:
+    """Return the camera of frames that are rectified for this one."""
+    return replace(camera, k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0, k4=0.0, k5=0.0, k6=0.0)
 
 
 def _with_camera(camera: Camera) -> Callable[[Encounters], Encounters]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +25,7 @@ from kgcp.quality.checks.encounters import Encounters, misfit_of
 from kgcp.quality.checks.measured import _of_encounters
 from kgcp.quality.checks.mount import check_mount
 from kgcp.quality.checks.patterns import check_lone_frames, patterns, unexplained
-from kgcp.quality.checks.slips import remeasured, slips
+from kgcp.quality.checks.slips import remeasured, slips, without_distortion
 from tests.wrong_flights.flights import CAMERA, changed, flight
 
 
@@ -221,3 +222,21 @@ def test_a_mount_between_right_angles_is_reported_as_estimated(encounters: Encou
     )
     assert "set [vehicle] mount_deg = 0, unless headings are wrong" in doubt.remedy
     assert doubt.figures["mount_deg"] == pytest.approx(0.0, abs=2.0)
+
+
+def test_rectified_frames_are_recognised(encounters: Encounters) -> None:
+    """Distances are then wrong by an amount that grows towards the corners."""
+    barrel = replace(encounters.camera, k1=-0.2)
+    rectified = replace(encounters, camera=without_distortion(barrel))
+    (doubt,) = causes_of(remeasured(rectified, barrel))
+    assert doubt.code is Cause.DISTORTION
+    assert "the frames seem to be rectified" in doubt.sentence
+
+
+def test_a_missing_distortion_is_recognised(encounters: Encounters) -> None:
+    barrel = replace(without_distortion(encounters.camera), k1=-0.2)
+    (doubt,) = causes_of(remeasured(replace(encounters, camera=barrel), without_distortion(barrel)))
+    assert doubt.code is Cause.DISTORTION
+    assert "but the camera has none" in doubt.sentence
+    (k1,) = re.findall(r"only k1 is given, (-0\.\d+) fits best", doubt.remedy)
+    assert float(k1) == pytest.approx(-0.2, abs=0.02)
