@@ -218,6 +218,9 @@ WITH_REFERENCE: Mapping[str, Slip] = {
     "a focal length of another zoom": _slip(
         _camera(scaled(CAMERA, 1.03, "fx", "fy")), Cause.DISTANCE_SCALE
     ),
+    "a focal length 0.8 % too long": _slip(
+        _camera(scaled(CAMERA, 1.008, "fx", "fy")), Cause.DISTANCE_SCALE
+    ),
     "k1 and k2 of the opposite sign": _slip(
         _camera(changed(CAMERA, k1=0.081, k2=-0.064)), Cause.DISTORTION_SIGN
     ),
