@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from kgcp.geometry.camera import Camera
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
+from kgcp.quality.number_text import counted
 
 # Credible focal lengths: the least over the longer side of the frame, which is a field of view of
 # 136°, beyond lenses of this distortion model; the largest over the shorter side, a lens of 1000 mm
@@ -18,9 +21,10 @@ _MAX_OFF_CENTRE = 0.12  # of a principal point, in frame sizes
 
 
 def check_camera(camera: Camera, *, is_guessed: bool = False) -> Iterator[Doubt]:
-    """Yield doubts about focal lengths in millimetres, wrong principal points, and guesses."""
+    """Yield doubts about focal lengths, principal points, distortions, and guesses."""
     yield from _check_focal_length(camera)
     yield from _check_principal_point(camera)
+    yield from _check_corners(camera)
     if is_guessed:
         yield mild(
             Cause.GUESSED_CAMERA,
@@ -94,3 +98,19 @@ def _check_principal_point(camera: Camera) -> Iterator[Doubt]:
     else:
         remedy = "look cx and cy up in the calibration, in pixels from the top-left pixel"
     yield grave(Cause.PRINCIPAL_POINT, sentence, remedy, figures)
+
+
+def _check_corners(camera: Camera) -> Iterator[Doubt]:
+    """Yield the doubt about a distortion that ends inside the frame."""
+    right, bottom = camera.width - 1.0, camera.height - 1.0
+    corners = np.array([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
+    count = int(np.count_nonzero(np.isnan(camera.undistort(corners)).any(axis=1)))
+    if count:
+        yield mild(
+            Cause.DISTORTION,
+            f"the distortion k1 = {camera.k1:g}, k2 = {camera.k2:g} … folds back inside the frame:"
+            f" {counted(count, 'corner')} of the frame cannot be seen through such a lens, and"
+            " distances are wrong towards the corners",
+            "look the coefficients up in the calibration, or calibrate with points in the corners",
+            {"corners": float(count)},
+        )

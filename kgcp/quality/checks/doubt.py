@@ -50,7 +50,7 @@ class Cause(StrEnum):
     DISTORTION_SIGN = "distortion_sign", "k1, k2 … have the sign of another distortion model"
     DISTORTION = (
         "distortion",
-        "the frames are rectified and the camera is not, or the camera's distortion is left out",
+        "the distortion is not that of the frames: it is left out, undone in them, or folds back",
     )
     DIAMETERS = (
         "diameters",

@@ -17,7 +17,8 @@ CAMERA = Camera(1200, 900, 1903.0, 1901.0, 606.2, 446.1)
 def test_cameras_in_pixels_raise_no_doubt() -> None:
     wide = replace(CAMERA, fx=700.0, fy=700.0)
     tele = replace(CAMERA, fx=15_000.0, fy=15_000.0)
-    for camera in (CAMERA, wide, tele, CAMERA.binned(4)):
+    barrel = replace(wide, k1=-0.3, k2=0.12, k3=-0.02)
+    for camera in (CAMERA, wide, tele, barrel, CAMERA.binned(4)):
         assert not [*check_camera(camera)]
 
 
@@ -31,6 +32,8 @@ def test_cameras_in_pixels_raise_no_doubt() -> None:
         ({"cx": 0.0, "cy": 0.0}, Cause.PRINCIPAL_POINT, "half the frame's size"),
         ({"cx": 1212.4, "cy": 892.2}, Cause.CALIBRATION_SIZE, "of double size"),
         ({"cx": 303.0, "cy": 223.0}, Cause.CALIBRATION_SIZE, "of half size"),
+        ({"k1": -1.2}, Cause.DISTORTION, "4 corners of the frame cannot be seen"),
+        ({"k1": -0.9, "cx": 680.0}, Cause.DISTORTION, "2 corners of the frame cannot be seen"),
         ({"cx": 650.0, "cy": 700.0}, Cause.PRINCIPAL_POINT, "look cx and cy up"),
     ],
 )
