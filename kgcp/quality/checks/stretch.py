@@ -79,15 +79,13 @@ class _Views:
         across = np.stack((x, np.cross(ray, x)), axis=1)
         return cls(across, across @ encounters.camera_from_plate[known, :, :2], body[known])
 
-    def circles(self, tilt: FloatArray) -> FloatArray:
-        """Return the images (n, 2, 2) of a circle, if the plate has a tilt (2,) on the vehicle.
+    def circles(self, normal: FloatArray) -> FloatArray:
+        """Return the images (n, 2, 2) of a circle with a normal (3,) of any length in body axes.
 
-        Each is the matrix A Aᵀ, where A maps the unit circle to its image. `tilt` are the first two
-        components of the normal in body axes, relative to the third.
+        Each is the matrix A Aᵀ, where A maps the unit circle to its image.
         """
-        normal = np.append(tilt, 1.0)
-        normal /= np.linalg.norm(normal)
-        seen = self.across @ (self.camera_from_body @ normal)[:, :, None]
+        unit = normal / np.linalg.norm(normal)
+        seen = self.across @ (self.camera_from_body @ unit)[:, :, None]
         return np.asarray(np.eye(2) - seen @ np.swapaxes(seen, 1, 2))
 
     def stretches(self, circles: FloatArray) -> FloatArray:
@@ -104,19 +102,22 @@ class _Views:
 
     def fit(self, *, is_image: bool) -> _Stretch:
         """Adjust the plate's tilt on the vehicle and a stretch of the plate, or of the images."""
-        normals = np.swapaxes(self.camera_from_body, 1, 2) @ self._measured_normals()[:, :, None]
-        tilt = np.median(normals[:, :2, 0] / normals[:, 2:, 0], axis=0)
+        body_from_camera = np.swapaxes(self.camera_from_body, 1, 2)
+        normals = (body_from_camera @ self._measured_normals()[:, :, None])[:, :, 0]
+        normal = np.median(normals, axis=0)
         for _ in range(_STEPS):
-            circles = self.circles(tilt)
+            normal /= np.linalg.norm(normal)
+            tilts = np.linalg.svd(normal[None])[2][1:]  # two directions perpendicular to it
+            circles = self.circles(normal)
             seen = self.stretches(circles)
             by_tilt = [
-                (seen - self.stretches(self.circles(tilt + _STEP * axis))) / _STEP
-                for axis in np.eye(2)
+                (seen - self.stretches(self.circles(normal + _STEP * tilt))) / _STEP
+                for tilt in tilts
             ]
             by_stretch = self._by_image(circles, seen) if is_image else _by_plate(len(seen))
             design = np.stack((*by_tilt, *by_stretch), axis=1)
             values, sds, scatter = _robust_fit(design, seen)
-            tilt = tilt + values[:2]
+            normal = normal + values[:2] @ tilts
         along, diagonal = values[2:].tolist()
         return _Stretch(
             share=math.hypot(along, diagonal),

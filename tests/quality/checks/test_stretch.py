@@ -36,7 +36,13 @@ def stretched(direction_deg: float) -> FloatArray:
     return np.eye(2) + 0.5 * _SHARE * np.array([[cosine, sine], [sine, -cosine]])
 
 
-def seen_as(encounters: Encounters, *, plate: FloatArray, image: FloatArray) -> Encounters:
+def seen_as(
+    encounters: Encounters,
+    *,
+    plate: FloatArray,
+    image: FloatArray,
+    mount: FloatArray = _MOUNT_TILT,
+) -> Encounters:
     """Return the encounters with the poses of round circles that look like stretched ones.
 
     They have random errors of `_SD_DEG` about each axis. The views are orthogonal projections along
@@ -44,7 +50,7 @@ def seen_as(encounters: Encounters, *, plate: FloatArray, image: FloatArray) -> 
     sign: those that are nearer to the truth are taken.
     """
     body = np.swapaxes(encounters.enu_from_camera, 1, 2) @ encounters.frame_from_body
-    true = body @ rotation_about(_MOUNT_TILT) @ body_from_plate(0.0)
+    true = body @ rotation_about(mount) @ body_from_plate(0.0)
     rotations = []
     rng = np.random.default_rng(1)
     for rotation, centre in zip(true, encounters.in_camera_m, strict=True):
@@ -91,6 +97,17 @@ def test_stretched_images_are_recognised(encounters: Encounters, direction_deg: 
     assert abs((float(found) - direction_deg + 90.0) % 180.0 - 90.0) < 3.0
     assert "print" not in doubt.sentence
     assert "fx, fy and readout_s" in doubt.remedy
+
+
+def test_a_plate_on_the_side_of_the_vehicle_may_be_stretched(encounters: Encounters) -> None:
+    """Its normal has no component along the vehicle's vertical axis."""
+    mount = np.array([0.5 * np.pi, 0.0, 0.0])
+    body = encounters.frame_from_body
+    turn = body @ rotation_about(mount) @ np.swapaxes(body, 1, 2)
+    seen = replace(encounters, enu_from_camera=turn @ encounters.enu_from_camera)
+    (doubt,) = check_stretch(seen_as(seen, plate=stretched(20.0), image=np.eye(2), mount=mount))
+    assert doubt.figures["stretch"] == pytest.approx(_SHARE, rel=0.01)
+    assert doubt.figures["sd_stretch"] < 0.02 * _SHARE
 
 
 def test_images_under_a_rolling_shutter_are_not_tested(encounters: Encounters) -> None:
