@@ -219,7 +219,8 @@ def _scatter(numbers: BiasNumbers) -> Iterator[Finding]:
         yield Finding(
             FlightGrade.LOOK,
             f"Residuals scatter {spread:.1f} times as much as their reported standard deviations"
-            " predict: the standard deviations of trajectory and reference poses may be too small.",
+            " predict: the standard deviations of trajectory and reference poses may be too small,"
+            " the ring not round, the plate not flat, or the distortion in [camera] wrong.",
             "standardised",
         )
     elif spread < LIMITS.standardised_low:

@@ -125,9 +125,9 @@ def test_a_flight_of_rubbish_is_not_usable(fly: Fly) -> None:
 
 
 def test_standard_deviations_that_are_too_small_are_found(fly: Fly) -> None:
-    assert "times as much as their reported standard deviations" in texts(
-        fly(sd_m=0.005), FlightGrade.LOOK
-    )
+    too_small = texts(fly(sd_m=0.005), FlightGrade.LOOK)
+    assert "times as much as their reported standard deviations" in too_small
+    assert "the ring not round, the plate not flat, or the distortion" in too_small
     too_large = fly(sd_m=0.1)
     assert "may be too large" in texts(too_large)
     assert assess(too_large).grade is FlightGrade.GOOD
