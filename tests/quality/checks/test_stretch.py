@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -11,10 +12,12 @@ import pytest
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import rotation_about
 from kgcp.georef.camera_priors import body_from_plate
+from kgcp.quality.checks import measured
 from kgcp.quality.checks.doubt import Cause
 from kgcp.quality.checks.encounters import Encounters
 from kgcp.quality.checks.measured import _of_encounters
 from kgcp.quality.checks.stretch import check_stretch
+from kgcp.quality.consistency import Consistency
 from tests.quality.checks.test_slips import of
 from tests.wrong_flights.flights import CAMERA
 
@@ -86,6 +89,18 @@ def test_a_stretched_print_is_recognised(encounters: Encounters, direction_deg: 
     assert float(found) == pytest.approx(direction_deg, abs=3.0)
     assert "images" not in doubt.sentence
     assert "diameter in several directions" in doubt.remedy
+
+
+def test_a_stretched_print_is_not_compensated_by_corrections(
+    encounters: Encounters, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A shorter lever arm, for example, would explain a part of the wrong distances."""
+    monkeypatch.setattr(measured, "is_explained", lambda _: True)
+    monkeypatch.setattr(measured, "corrections", lambda _: [("they differ", "add 0.04 m")])
+    consistency = cast("Consistency", object())
+    assert [doubt.code for doubt in _of_encounters(encounters, consistency)] == [Cause.CORRECTION]
+    seen = seen_as(encounters, plate=stretched(20.0), image=np.eye(2))
+    assert [doubt.code for doubt in _of_encounters(seen, consistency)] == [Cause.STRETCH]
 
 
 @pytest.mark.parametrize("direction_deg", [0.0, 135.0])
