@@ -12,7 +12,8 @@ Together this saves half a second per process.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import update_wrapper
 from typing import Any, TypeVar, cast
 
@@ -25,6 +26,47 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 _PREFETCH_ARGUMENTS = 0, 3, 1  # of llvm.prefetch: read access, keep in all cache levels, data cache
 # Interpreting this many calls takes as long as loading numba and the cached code: 0.5 s.
 _CALLS_BEFORE_COMPILING = 100_000
+
+
+class _CompiledCodeFiles:
+    """numba's cache of one function, with the methods that numba calls.
+
+    numba does not flush the files to the disk, so a power failure can leave them empty. It would
+    then raise whatever reading them raises, in every later run.
+
+    Raises
+    ------
+    KgcpError
+        By all methods, if a file cannot be written.
+    """
+
+    def __init__(self, files: Any) -> None:  # noqa: ANN401 - numba's
+        self._files = files
+        self.cache_path: str = files.cache_path
+
+    def load_overload(self, sig: object, target_context: object) -> Any:  # noqa: ANN401 - numba's
+        """Return the compiled code for these types; None if there is none, or if it is damaged."""
+        try:
+            return self._files.load_overload(sig, target_context)
+        except Exception:  # a damaged pickle can raise any
+            with self._writing():
+                self._files.flush()
+            return None
+
+    def save_overload(self, sig: object, data: object) -> None:
+        """Store compiled code for these types."""
+        with self._writing():
+            self._files.save_overload(sig, data)
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise KgcpError(
+                f"{self.cache_path}: compiled code cannot be stored ({error.strerror}); make room,"
+                " or set the environment variable NUMBA_CACHE_DIR to another folder"
+            ) from error
 
 
 class _Compilable:
@@ -64,14 +106,16 @@ class _Compilable:
         """
         if self._dispatcher is None:
             import numba
+            from numba.core.caching import FunctionCache
 
             function = self._function
             for name in function.__code__.co_names:
                 called = function.__globals__.get(name)
                 if isinstance(called, _Compilable) and called is not self:
                     function.__globals__[name] = called.dispatcher()
+            made = numba.njit(error_model="numpy", **self._options)(function)
             try:
-                made = numba.njit(cache=True, error_model="numpy", **self._options)(function)
+                made._cache = _CompiledCodeFiles(FunctionCache(function))  # as `cache=True` does
             except RuntimeError as error:  # numba found no writable cache folder
                 raise KgcpError(
                     f"compiled code cannot be stored in any folder ({error}); set the environment"

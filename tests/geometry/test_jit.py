@@ -1,14 +1,18 @@
 from __future__ import annotations
 
 import ast
+import errno
 import importlib.util
+import os
 import sys
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
+from numba.core.caching import IndexDataCacheFile
 
+from kgcp.errors import KgcpError
 from kgcp.geometry import _jit, distortion
 from kgcp.geometry.arrays import FloatArray
 
@@ -108,3 +112,49 @@ def test_functions_with_reordered_sums_are_called_by_python_only(
         assert not callers, f"{path}: {callers} call {entry}"
         entries |= entry
     assert entries == {"render", "weighted_products"}
+
+
+SMALL_MODULE = """
+from kgcp.geometry._jit import compiled
+
+
+@compiled
+def doubled(number):
+    return 2 * number
+"""
+
+
+def _small_module(folder: Path) -> ModuleType:
+    """Import a module with one function, whose compiled code is stored below the folder."""
+    file = folder / "small.py"
+    if not file.exists():
+        file.write_text(SMALL_MODULE, "utf-8")
+    spec = importlib.util.spec_from_file_location("small", file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("content", [b"", b"\0" * 600, b"\x80\x04K\x01"])
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+def test_damaged_compiled_code_is_replaced(tmp_path: Path, suffix: str, content: bytes) -> None:
+    assert _small_module(tmp_path).doubled(4) == 8
+    (file,) = tmp_path.rglob(f"*.{suffix}")
+    file.write_bytes(content)
+    assert _small_module(tmp_path).doubled(4) == 8
+    again = _small_module(tmp_path)
+    again.doubled(4)
+    assert sum(again.doubled.stats.cache_hits.values()) == 1
+
+
+def test_folder_of_compiled_code_that_cannot_be_written_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def save(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(IndexDataCacheFile, "save", save)
+    with pytest.raises(KgcpError, match=r"__pycache__: compiled code cannot be stored \(No space"):
+        _small_module(tmp_path).doubled(4)
