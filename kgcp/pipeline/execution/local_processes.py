@@ -11,6 +11,7 @@ with the system's libraries, and each process loads everything.
 
 from __future__ import annotations
 
+import errno
 import multiprocessing
 import os
 import pickle
@@ -185,8 +186,8 @@ class WorkerProcess:
 
     def _start(self) -> _Connection:
         for _ in range(_MAX_STARTS):
-            parent_end, child_end = _CONTEXT.Pipe()
             try:
+                parent_end, child_end = _CONTEXT.Pipe()
                 with self._lock:
                     if self._is_ended:
                         raise Lost(TaskFailure.CRASHED)
@@ -201,10 +202,16 @@ class WorkerProcess:
                 parent_end.recv()  # the process has started, which does not count as work
                 if self._preparation is not None:
                     self._prepare(parent_end, self._preparation)
-            except (EOFError, OSError, Lost):
+            except (EOFError, OSError, Lost) as error:
                 self._kill()
                 if self._is_ended:
                     raise Lost(TaskFailure.CRASHED) from None
+                if isinstance(error, OSError) and error.errno == errno.EMFILE:
+                    raise KgcpError(
+                        "worker processes cannot be started (too many open files); raise the"
+                        " limit (ulimit -n), or use fewer of them",
+                        option="jobs",
+                    ) from error
             except BaseException:
                 self._kill()
                 raise

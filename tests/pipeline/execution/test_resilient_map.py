@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import multiprocessing
 import os
 import signal
@@ -249,6 +250,15 @@ def test_processes_that_cannot_start_are_a_one_line_error(monkeypatch: pytest.Mo
     with pool(1) as executor, pytest.raises(KgcpError, match=text) as caught:
         list(resilient_map(abs, (1, 2), executor, 1))
     assert caught.value.on_command_line().endswith(" (--jobs 0)")
+
+
+def test_a_limit_of_open_files_is_a_one_line_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def pipe() -> None:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    monkeypatch.setattr("kgcp.pipeline.execution.local_processes._CONTEXT.Pipe", pipe)
+    with pytest.raises(KgcpError, match=r"cannot be started \(too many open files\)"):
+        WorkerProcess(LIMIT_S).call(abs, 1)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a server of processes")
