@@ -440,11 +440,6 @@ class DetectionRun:
             )
 
     def _report_kept_results(self) -> None:
-        if self._journal.changes:
-            changes = ", ".join(self._journal.changes)
-            self._listener.note(
-                f"starting over instead of resuming the interrupted run: {changes} changed since"
-            )
         in_journal = set(self._journal)
         names = {_name_of(key) for key in in_journal}
         is_settled = self._job.tone_base is not None

@@ -231,18 +231,17 @@ def test_what_changed_is_done_again(flight: Path, looks: Counter[str]) -> None:
         (("", ""), 7.0, "the settings"),
     ],
 )
-def test_what_all_depends_on_starts_anew(
+def test_a_change_of_what_all_depends_on_loses_nothing(
     edit: tuple[str, str], min_radius_px: float, what: str, flight: Path, looks: Counter[str]
 ) -> None:
     stop(flight, 3)
     text = (flight / "flight.toml").read_text(encoding="utf-8")
     (flight / "flight.toml").write_text(text.replace(*edit), encoding="utf-8")
-    listener = Stop()
-    detect(flight, listener, min_radius_px=min_radius_px)
-    assert listener.notes == [
-        f"starting over instead of resuming the interrupted run: {what} changed since"
-    ]
-    assert looks["f_0.png"] == 2
+    with pytest.raises(KgcpError, match=rf"run, and {what} changed since; undo this to resume"):
+        detect(flight, min_radius_px=min_radius_px)
+    (flight / "flight.toml").write_text(text, encoding="utf-8")
+    detect(flight)
+    assert looks["f_0.png"] == 1
 
 
 def test_a_table_that_cannot_be_written_keeps_the_journal(

@@ -2,8 +2,9 @@
 
 A journal is a file of lines: a checksum, a key, and the result of one frame. The key covers
 everything that the result depends on, so that a result is found again if and only if all of it is
-unchanged. The first line states what all results depend on. Each line is appended as soon as its
-result exists. Whatever ends the run leaves at most one broken line, which is ignored.
+unchanged. The first line states what all results depend on. A run that depends on something else is
+refused: otherwise a mistyped option would cost all results so far. Each line is appended as soon as
+its result exists. Whatever ends the run leaves at most one broken line, which is ignored.
 
 Records are written as text without loss of precision. They are not pickled, because a journal is
 in a folder that may come from anywhere, and a pickle may run code. A database would not help:
@@ -38,6 +39,7 @@ from kgcp.io.files.safe_read import is_file
 from kgcp.measurement import records
 from kgcp.measurement.field_photograph import PhotoDiscs, PhotoMiss
 from kgcp.measurement.records import Considered, FrameResult, Imaging, Miss, TimeSource, ToneBase
+from kgcp.quality.number_text import counted
 
 # All record types of which a result may consist; `records` also imports those of other modules.
 _RECORDS: dict[str, type] = {
@@ -147,7 +149,7 @@ class Journal(Generic[Result]):
     ------
     KgcpError
         Here and by all methods, if another process has the journal, or it cannot be read or
-        written.
+        written; here also if its results were made with something else.
     """
 
     def __init__(
@@ -162,21 +164,21 @@ class Journal(Generic[Result]):
         self._kinds = kinds
         self._due_s = time.monotonic() + _MIN_FLUSH_INTERVAL_S
         self.seconds = 0.0  # spent here, for the run's record
-        # inputs that have changed since the journal was written, so that it was emptied
-        self.changes: tuple[str, ...] = ()
         self._is_left = False
-        self._writer = _locked(path)
-        with self._access():
-            self._reader = path.open("rb")
-            self._offsets = self._find_lines()
-            made_by = self._made_by()
-            if is_new or made_by != making:
-                if made_by and not is_new:
-                    self.changes = tuple(key for key in making if made_by.get(key) != making[key])
-                self._writer.truncate(0)
-                self._reader.seek(0, os.SEEK_END)  # discards the reader's buffer
-                self._offsets.clear()
-                self._append(_MADE_BY, json.dumps(dict(making)))
+        with ExitStack() as stack:
+            self._writer = stack.enter_context(_locked(path))
+            with self._access():
+                self._reader = stack.enter_context(path.open("rb"))
+                self._offsets = self._find_lines()
+                made_by = self._made_by()
+                if is_new or made_by != making:
+                    if not is_new:
+                        self._refuse_to_lose_results(made_by, making)
+                    self._writer.truncate(0)
+                    self._reader.seek(0, os.SEEK_END)  # discards the reader's buffer
+                    self._offsets.clear()
+                    self._append(_MADE_BY, json.dumps(dict(making)))
+            stack.pop_all()
 
     def __enter__(self) -> Self:
         return self
@@ -257,6 +259,19 @@ class Journal(Generic[Result]):
                 if os.name != "nt":
                     raise
                 self._is_left = True  # Windows does not delete open files
+
+    def _refuse_to_lose_results(
+        self, made_by: Mapping[str, str], making: Mapping[str, str]
+    ) -> None:
+        """Refuse to empty a journal whose results would be kept if a change were undone."""
+        results = sum(1 for _ in self)
+        if made_by and results:
+            changes = ", ".join(key for key in making if made_by.get(key) != making[key])
+            raise KgcpError(
+                f"{self._path}: has {counted(results, 'result')} of an interrupted run, and"
+                f" {changes} changed since; undo this to resume, or start over",
+                option="restart",
+            )
 
     def _append(self, key: str, text: str) -> None:
         body = f"{key} {text}\n".encode()
