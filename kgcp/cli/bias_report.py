@@ -43,6 +43,7 @@ def command(
 
     Example: kgcp bias-report sample_flight
     """
+    from kgcp.io.files.locks import sole_writer
     from kgcp.io.flight.flight import read_flight
     from kgcp.pipeline.workspace import DETECTIONS, open_workspace
     from kgcp.report.plotting import load_matplotlib
@@ -54,9 +55,10 @@ def command(
         the_flight = read_flight(workspace.flight)
         bias = bias_study(the_flight, workspace.detections(detections))
         print_doubts(bias.doubts)
-        report = bias.write_report(
-            workspace.out, reexpose=reexpose, stored_frames=workspace.frames_of(the_flight)
-        )
+        with sole_writer(workspace.out, "bias-report"):
+            report = bias.write_report(
+                workspace.out, reexpose=reexpose, stored_frames=workspace.frames_of(the_flight)
+            )
     if as_json:
         import json
 

@@ -194,6 +194,7 @@ def _export_one(
 
     from kgcp.georef.gcp import with_flight_name
     from kgcp.io.exporters.write import not_renewed
+    from kgcp.io.files.locks import sole_writer
     from kgcp.io.flight.flight import read_flight
     from kgcp.pipeline.export import export_gcps, write_gcps
     from kgcp.pipeline.workspace import DETECTIONS, open_workspace
@@ -203,13 +204,14 @@ def _export_one(
         (made,) = _made([(the_flight, workspace.detections(detections))], choice)
         if flight_ids:
             made = replace(made, gcps=with_flight_name(made.gcps, the_flight.name))
-        written = write_gcps(made, workspace.out)
-        more, left_out = _export(
-            files.formats,
-            lambda name: export_gcps(made, (name,), workspace.out, **files.details),
-        )
-        written += more
-        older = not_renewed(workspace.out, written)
+        with sole_writer(workspace.out, "export-gcp"):
+            written = write_gcps(made, workspace.out)
+            more, left_out = _export(
+                files.formats,
+                lambda name: export_gcps(made, (name,), workspace.out, **files.details),
+            )
+            written += more
+            older = not_renewed(workspace.out, written)
     _report([made], made, (written, left_out, older), workspace.named, as_json=as_json)
 
 
@@ -223,6 +225,7 @@ def _export_several(
 ) -> None:
     from kgcp.errors import KgcpError
     from kgcp.io.exporters.write import not_renewed
+    from kgcp.io.files.locks import sole_writer
     from kgcp.io.flight.flight import read_flight
     from kgcp.pipeline.merge import export_merged, merge_gcps, write_merged
     from kgcp.pipeline.workspace import DETECTIONS, results_folder
@@ -237,12 +240,13 @@ def _export_several(
             )
         read.append((read_flight(flight), results_folder(flight) / DETECTIONS))
     merged = merge_gcps(_made(read, choice))
-    written = write_merged(merged, out)
-    more, left_out = _export(
-        files.formats, lambda name: export_merged(merged, (name,), folder=out, **files.details)
-    )
-    written += more
-    older = not_renewed(out, written)
+    with sole_writer(out, "export-gcp"):
+        written = write_merged(merged, out)
+        more, left_out = _export(
+            files.formats, lambda name: export_merged(merged, (name,), folder=out, **files.details)
+        )
+        written += more
+        older = not_renewed(out, written)
     _report(merged.parts, merged, (written, left_out, older), str, as_json=as_json)
 
 

@@ -134,6 +134,7 @@ def _orient_by_targets(
     free_focal: bool,
     as_json: bool,
 ) -> None:
+    from kgcp.io.files.locks import sole_writer
     from kgcp.io.flight.flight import read_flight
     from kgcp.pipeline.ground.orient import OrientOptions, orient_flight, write_poses
     from kgcp.pipeline.workspace import DETECTIONS, open_workspace
@@ -142,7 +143,8 @@ def _orient_by_targets(
     with open_workspace(flight, out, (DETECTIONS,)) as workspace:
         the_flight = read_flight(workspace.flight)
         poses = orient_flight(the_flight, workspace.detections(detections), options)
-        written = write_poses(poses, workspace.out)
+        with sole_writer(workspace.out, "orient"):
+            written = write_poses(poses, workspace.out)
     if as_json:
         import json
 

@@ -95,14 +95,16 @@ def command(
 
     load_matplotlib()  # before the report does
     from kgcp.io.exporters.write import not_renewed
+    from kgcp.io.files.locks import sole_writer
     from kgcp.pipeline.ground.place import EXPORTS, PlaceOptions, place_flight, write_places
 
     options = PlaceOptions(targets, poses, min_frames, has_exact_poses=eo == "fixed")
     with open_workspace(flight, out, (DETECTIONS,)) as workspace:
         the_flight = read_flight(workspace.flight)
         places = place_flight(the_flight, workspace.detections(detections), options)
-        written = write_places(places, workspace.out, formats)
-        older = not_renewed(workspace.out / EXPORTS, written)
+        with sole_writer(workspace.out, "place"):
+            written = write_places(places, workspace.out, formats)
+            older = not_renewed(workspace.out / EXPORTS, written)
     if as_json:
         import json
 

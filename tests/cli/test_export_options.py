@@ -16,6 +16,7 @@ from click.testing import CliRunner, Result
 from kgcp.cli import main
 from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.local_frame import LocalFrame
+from kgcp.io.files.locks import sole_writer
 from kgcp.io.tables.columns import time_cell
 from kgcp.io.tables.consistency import CONSISTENCY_COLUMNS
 from kgcp.io.tables.detections import DETECTION_COLUMNS
@@ -253,3 +254,13 @@ def test_without_the_reference_file_there_is_no_comparison(folder: Path) -> None
     (folder / "reference.csv").unlink()
     assert json.loads(_export(folder, "--json").stdout)["advice"] == []
     assert not (folder / "kgcp" / "consistency.json").exists()
+
+
+def test_two_exports_do_not_write_to_one_folder(folder: Path) -> None:
+    with sole_writer(folder / "kgcp", "export-gcp"):
+        result = CliRunner().invoke(main, ["export-gcp", str(folder)])
+    assert result.exit_code == 1
+    assert "another kgcp is writing here; wait until it ends" in result.stderr
+    assert not (folder / "kgcp" / "kgcps.parquet").exists()
+    assert _export(folder).exit_code == 0
+    assert not [*(folder / "kgcp").glob(".*")]

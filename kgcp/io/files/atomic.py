@@ -90,13 +90,14 @@ def write_bytes(path: Path, content: bytes) -> None:
 def unwritable(path: Path, error: OSError) -> KgcpError:
     """Return the error of a result that cannot be written.
 
-    On a full disk, another results folder would be the wrong remedy: an interrupted run can only be
-    resumed in the old one.
+    An interrupted run can only be resumed in its results folder: another one is not the remedy for
+    a full disk, and the second one for a protected folder.
     """
     if error.errno in {errno.ENOSPC, errno.EDQUOT}:
         return KgcpError(f"{path}: no space left; make room, then repeat the command")
+    remedy = "make the folder writable, or " if error.errno == errno.EACCES else ""
     return KgcpError(
-        f"{path}: cannot be written ({error}); choose another results folder", option="out"
+        f"{path}: cannot be written ({error}); {remedy}choose another results folder", option="out"
     )
 
 

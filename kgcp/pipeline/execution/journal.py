@@ -18,7 +18,6 @@ import errno
 import hashlib
 import json
 import os
-import stat
 import time
 import zlib
 from collections.abc import Iterator, Mapping
@@ -26,7 +25,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import cache, partial
-from io import FileIO
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Generic, Self, TypeVar
@@ -34,7 +32,8 @@ from typing import Any, Generic, Self, TypeVar
 import numpy as np
 
 from kgcp.errors import KgcpError, Reason
-from kgcp.io.files.portable import OPEN_FLAGS, lock
+from kgcp.io.files.locks import is_at, open_locked
+from kgcp.io.files.portable import lock
 from kgcp.io.files.safe_read import is_file
 from kgcp.measurement import records
 from kgcp.measurement.field_photograph import PhotoDiscs, PhotoMiss
@@ -166,7 +165,7 @@ class Journal(Generic[Result]):
         self.seconds = 0.0  # spent here, for the run's record
         self._is_left = False
         with ExitStack() as stack:
-            self._writer = stack.enter_context(_locked(path))
+            self._writer = stack.enter_context(open_locked(path))
             with self._access():
                 self._reader = stack.enter_context(path.open("rb"))
                 self._offsets = self._find_lines()
@@ -251,7 +250,7 @@ class Journal(Generic[Result]):
         If the user has deleted it, another run may have a new one of that name, which is kept.
         """
         with self._access():
-            if not _is_at(self._path, self._writer):
+            if not is_at(self._path, self._writer):
                 return
             try:
                 self._path.unlink()  # before its lock is released
@@ -339,41 +338,3 @@ def _key_of(line: bytes) -> str | None:
     if checksum != b"%08x" % zlib.crc32(body):
         return None
     return body.partition(b" ")[0].decode(errors="replace")
-
-
-def _is_at(path: Path, file: FileIO) -> bool:
-    """Tell whether a path still leads to a file that is open."""
-    return path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())
-
-
-def _locked(path: Path) -> FileIO:
-    """Open a file for writing, created if needed, that no other process has open.
-
-    The kernel holds the lock, and releases it when the process ends in whatever way.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_symlink():
-            raise OSError(errno.ELOOP, "is a link; delete it")
-        while True:
-            flags = os.O_RDWR | os.O_CREAT | OPEN_FLAGS
-            with ExitStack() as stack:
-                file = stack.enter_context(FileIO(os.open(path, flags, 0o644), "r+"))
-                if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                    raise OSError(errno.EINVAL, "is not a file; delete it")
-                lock(file.fileno())
-                # another process may have deleted the file between opening and locking
-                if _is_at(path, file):
-                    stack.pop_all()
-                    return file
-    except BlockingIOError as error:
-        raise KgcpError(
-            f"{path.parent}: another kgcp is writing here; wait until it ends, or choose another"
-            " results folder",
-            option="out",
-        ) from error
-    except OSError as error:
-        raise KgcpError(
-            f"{path}: cannot be written ({error.strerror}); choose another results folder",
-            option="out",
-        ) from error

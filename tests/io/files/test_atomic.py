@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from kgcp.errors import KgcpError
-from kgcp.io.files.atomic import remove, whole_file, write_all, write_bytes
+from kgcp.io.files.atomic import remove, unwritable, whole_file, write_all, write_bytes
 from tests.systems import needs_links
 
 
@@ -127,3 +127,9 @@ def test_what_cannot_be_deleted_is_reported(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     with pytest.raises(KgcpError, match=r"a: is a folder"):
         remove(tmp_path / "a")
+
+
+def test_a_protected_folder_is_to_be_made_writable() -> None:
+    error = PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    text = str(unwritable(Path("t.parquet"), error))
+    assert text.endswith("; make the folder writable, or choose another results folder")

@@ -1,0 +1,86 @@
+"""Locks that keep several programs from writing the same results."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from io import FileIO
+from pathlib import Path
+
+from kgcp.errors import KgcpError
+from kgcp.io.files.portable import OPEN_FLAGS, lock
+
+
+def is_at(path: Path, file: FileIO) -> bool:
+    """Return whether a path still leads to a file that is open."""
+    return path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())
+
+
+def open_locked(path: Path) -> FileIO:
+    """Open a file for writing, created if needed, that no other process has open.
+
+    The kernel holds the lock, and releases it when the process ends in whatever way.
+
+    Raises
+    ------
+    KgcpError
+        If another process has it open, or it cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_symlink():
+            raise OSError(errno.ELOOP, "is a link; delete it")
+        while True:
+            flags = os.O_RDWR | os.O_CREAT | OPEN_FLAGS
+            with ExitStack() as stack:
+                file = stack.enter_context(FileIO(os.open(path, flags, 0o644), "r+"))
+                if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                    raise OSError(errno.EINVAL, "is not a file; delete it")
+                lock(file.fileno())
+                # another process may have deleted the file between opening and locking
+                if is_at(path, file):
+                    stack.pop_all()
+                    return file
+    except BlockingIOError as error:
+        raise KgcpError(
+            f"{path.parent}: another kgcp is writing here; wait until it ends, or choose another"
+            " results folder",
+            option="out",
+        ) from error
+    except OSError as error:
+        # an interrupted run can only be resumed here
+        remedy = "make it writable, or " if isinstance(error, PermissionError) else ""
+        raise KgcpError(
+            f"{path}: cannot be written ({error.strerror}); {remedy}choose another results folder",
+            option="out",
+        ) from error
+
+
+@contextmanager
+def sole_writer(folder: Path, command: str) -> Iterator[None]:
+    """Keep another run of a command from writing to the same folder until the block ends.
+
+    Both would use the same temporary names, and leave some files of each.
+
+    Raises
+    ------
+    KgcpError
+        If another run is writing there, or the folder cannot be written.
+    """
+    path = folder / f".{command}.lock"
+    with open_locked(path):
+        try:
+            yield
+        finally:
+            _delete(path)  # before its lock is released
+    if os.name == "nt":
+        _delete(path)
+
+
+def _delete(path: Path) -> None:
+    """Delete a lock's file, unless another program has it open on Windows; it does no harm."""
+    with suppress(OSError):
+        path.unlink()
