@@ -134,7 +134,8 @@ def command(
     25 to 40 degrees in all directions, two with the camera turned by 90 degrees.
 
     Writes camera.toml, with the full covariance, to be named as [camera] file in flight.toml;
-    tables of all discs, of the field and of the photographs; and calibration.html.
+    tables of all discs, of the field and of the photographs; and calibration.html. Ends with an
+    error if the verdict is that the camera is unusable.
 
     If a run is interrupted, repeat the command to resume it.
 
@@ -154,7 +155,14 @@ def command(
     from kgcp.report.plotting import load_matplotlib
 
     load_matplotlib()  # before the report does
-    from kgcp.pipeline.calibration.results import FIELD_FILES, require_formats, write_results
+    from kgcp.pipeline.calibration.results import (
+        CAMERA_FILE,
+        FIELD_FILES,
+        PAGE_FILE,
+        require_formats,
+        write_results,
+    )
+    from kgcp.quality.calibration_verdict import CalibrationGrade
 
     field = read_field(field_text, unit)
     refuse_to_overwrite_field(field_text, [out / name for name in FIELD_FILES])
@@ -185,6 +193,11 @@ def command(
         log.event("summary", **results.summary)
     elif not is_quiet:
         _report(results)
+    if results.verdict.grade is CalibrationGrade.UNUSABLE:
+        why = "; ".join(results.verdict.reasons)
+        raise KgcpError(
+            f"{out / CAMERA_FILE}: is unusable: {why}; see the advice in {out / PAGE_FILE}"
+        )
     if results.left_out:
         (why,) = set(results.left_out.values())
         raise KgcpError(

@@ -320,6 +320,17 @@ def test_too_few_photographs_are_one_line(photos: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "camera.toml").exists()
 
 
+@pytest.mark.usefixtures("_no_figures")
+def test_an_unusable_camera_is_an_error(photos: Path, tmp_path: Path) -> None:
+    three = [photos / f"photo{number}.png" for number in (1, 2, 3)]
+    result = run(*three, "--field", photos / "field.toml", "--out", tmp_path, *QUIET)
+    assert result.exit_code == 1
+    assert result.stderr.startswith(
+        f"kgcp: error: {tmp_path / 'camera.toml'}: is unusable: 3 photographs are fewer than 4"
+    )
+    assert (tmp_path / "camera.toml").exists()
+
+
 def test_copies_and_damaged_files_do_not_count(photos: Path, tmp_path: Path) -> None:
     folder = tmp_path / "photos"
     folder.mkdir()

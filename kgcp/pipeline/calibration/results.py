@@ -50,6 +50,7 @@ from kgcp.report.calibration.figures import draw_comparison, draw_figures
 from kgcp.report.calibration.page import CalibrationPage, CameraComparison, render_calibration
 
 CAMERA_FILE = "camera.toml"
+PAGE_FILE = "calibration.html"
 FIELD_FILES = ("field.toml", "field.csv")
 """Files of the stated and of the adjusted field."""
 
@@ -139,12 +140,12 @@ def write_results(
         ("field.parquet", FIELD_COLUMNS, (row_of(FIELD_COLUMNS, disc) for disc in discs)),
         ("photos.parquet", PHOTO_COLUMNS, (row_of(PHOTO_COLUMNS, row) for row in photos)),
     )
-    names = sorted([*texts, *(name for name, _, _ in tables), "calibration.html"])
+    names = sorted([*texts, *(name for name, _, _ in tables), PAGE_FILE])
     figures = draw_figures(calibration, numbers)
     if comparison is not None:
         figures["against"] = draw_comparison(calibration.camera, comparison.difference)
     page = CalibrationPage(calibration, numbers, verdict, photos, figures, names, comparison)
-    texts["calibration.html"] = render_calibration(page)
+    texts[PAGE_FILE] = render_calibration(page)
     about = {"schema_version": SCHEMA_VERSION, "kgcp_version": __version__}
     for name, columns, rows in tables:
         write_table(out / name, columns, rows, about)
