@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from kgcp.errors import KgcpError
 from kgcp.io.files.atomic import unwritable, whole_file
 from kgcp.io.files.safe_read import is_file, unreadable
-from kgcp.io.tables.columns import Column, ColumnType, Row
+from kgcp.io.tables.columns import SCHEMA_VERSION, Column, ColumnType, Row
 
 if TYPE_CHECKING:  # 0.3 s that writing does not need
     import pandas as pd
@@ -79,8 +79,8 @@ def read_table(path: Path, columns: Sequence[Column[Any]]) -> pd.DataFrame:
     Raises
     ------
     KgcpError
-        If the file is missing, not Parquet, lacks declared columns, or has them with another
-        type, twice, or with null in a key.
+        If the file is missing, not Parquet, of another version, lacks declared columns, or has them
+        with another type, twice, or with null in a key.
     """
     if not is_file(path):
         raise KgcpError(f"{path}: does not exist; run the command that writes it first")
@@ -91,6 +91,7 @@ def read_table(path: Path, columns: Sequence[Column[Any]]) -> pd.DataFrame:
     except (OSError, pa.ArrowException) as error:
         reason = (str(error).splitlines() or ["damaged"])[0]
         raise KgcpError(f"{path}: is not a readable Parquet table ({reason}); remake it") from error
+    _check_version(path, table.schema.metadata or {})
     missing = [column.name for column in columns if column.name not in table.column_names]
     if missing:
         raise KgcpError(
@@ -99,6 +100,16 @@ def read_table(path: Path, columns: Sequence[Column[Any]]) -> pd.DataFrame:
     _check_columns(path, table, columns)
     frame: pd.DataFrame = table.to_pandas()
     return frame
+
+
+def _check_version(path: Path, metadata: Mapping[bytes, bytes]) -> None:
+    """Refuse a table of another version, whose columns may mean something else."""
+    version = metadata.get(b"kgcp.schema_version", SCHEMA_VERSION.encode()).decode(errors="replace")
+    if version != SCHEMA_VERSION:
+        raise KgcpError(
+            f"{path}: is a table of version {version}, not {SCHEMA_VERSION};"
+            " remake it with this version of kgcp"
+        )
 
 
 def _check_columns(path: Path, table: pa.Table, columns: Sequence[Column[Any]]) -> None:

@@ -129,6 +129,14 @@ def test_missing_and_damaged_tables_are_a_one_line_error(tmp_path: Path) -> None
         assert str(path) in one_line(caught.value)
 
 
+@pytest.mark.parametrize("version", ["2", "99"])
+def test_a_table_of_another_version_is_refused(tmp_path: Path, version: str) -> None:
+    path = tmp_path / "t.parquet"
+    write_table(path, COLUMNS, ROWS, {"schema_version": version})
+    with pytest.raises(KgcpError, match=f"is a table of version {version}, not 3; remake it"):
+        read_table(path, COLUMNS)
+
+
 def test_a_table_of_other_columns_is_named_with_what_it_lacks(tmp_path: Path) -> None:
     path = tmp_path / "t.parquet"
     write_table(path, COLUMNS[:1], [{"name": "a"}], {})
