@@ -115,7 +115,10 @@ def test_other_frames_are_refused(measured: SampleFlight) -> None:
     )
     (measured.path / "archive").rename(frames)
     shutil.copy(frames / FRAMES[1], frames / FRAMES[0])
-    assert "changed since 'kgcp detect': files of frames; " in measured.fails("export-gcp")
+    changed = f"changed since 'kgcp detect': files of 1 frame ({FRAMES[0]}); "
+    assert changed in measured.fails("export-gcp")
+    (frames / FRAMES[2]).unlink()
+    assert changed in measured.fails("export-gcp")
     shutil.copy(frames / FRAMES[1], frames / "later.jpg")
     assert "'kgcp detect': a new frame (later.jpg); " in measured.fails("export-gcp")
 

@@ -61,7 +61,7 @@ def detections_provenance(
     Parameters
     ----------
     frame_sizes : mapping of str to int
-        Bytes of the file of every frame; None: missing.
+        Bytes of the file of every frame, in the order of the table; None: missing.
     times : FrameTimes
         Entries that belong to no frame are ignored.
     frame_patterns : sequence of str
@@ -85,6 +85,7 @@ def detections_provenance(
         **_program_and_flight(flight),
         "settings": json.dumps(asdict(settings), sort_keys=True),
         "inputs": json.dumps(values),
+        "frame_bytes": json.dumps([*frame_sizes.values()]),
         "digests": _digests(parts),
         **({} if learnt is None else {LEARNT_IMAGING: learnt_text(learnt)}),
         **({"choice": json.dumps({"frames": frame_patterns})} if frame_patterns else {}),

@@ -27,6 +27,7 @@ from kgcp.io.tables.provenance import (
     digested_times,
 )
 from kgcp.measurement.records import TimeSource
+from kgcp.quality.number_text import counted
 from kgcp.settings import DetectSettings
 
 if TYPE_CHECKING:  # 0.3 s that `kgcp detect` does not need
@@ -88,7 +89,7 @@ def require_current(path: Path, table: pd.DataFrame, flight: Flight) -> None:
     changes = [
         *_changed_keys(inputs, detection_inputs(flight)),
         *_changed_times(table, flight, digests, None if chosen == frames_now else frames_now),
-        *_changed_frames(table, flight, digests, chosen),
+        *_changed_frames(table, flight, metadata, chosen),
     ]
     if changes:
         not_shown = len(changes) - _MAX_CHANGES_SHOWN
@@ -120,11 +121,20 @@ def _chosen_frames(
 
 
 def _json(metadata: Mapping[bytes, bytes], key: bytes) -> dict[str, object]:
-    try:
-        values = json.loads(metadata.get(key, b"{}"))
-    except (ValueError, RecursionError):
-        values = {}
+    values = _parsed(metadata, key)
     return values if isinstance(values, dict) else {}
+
+
+def _values(metadata: Mapping[bytes, bytes], key: bytes) -> list[object]:
+    values = _parsed(metadata, key)
+    return values if isinstance(values, list) else []
+
+
+def _parsed(metadata: Mapping[bytes, bytes], key: bytes) -> object:
+    try:
+        return json.loads(metadata.get(key, b"null"))
+    except (ValueError, RecursionError):
+        return None
 
 
 def _remedy(path: Path, flight: Flight, settings: Mapping[str, object]) -> str:
@@ -238,18 +248,21 @@ def _to_middle_s(frames: pd.DataFrame, flight: Flight) -> FloatArray:
 def _changed_frames(
     table: pd.DataFrame,
     flight: Flight,
-    digests: Mapping[str, object],
+    metadata: Mapping[bytes, bytes],
     frames_now: list[str] | None,
 ) -> Iterator[str]:
     """Yield new or changed files of frames; missing frames do not count as a change."""
     if frames_now is None:
         return
-    known = set(table["frame"])
-    new = [frame for frame in frames_now if frame not in known]
+    known = table["frame"].drop_duplicates().to_list()
+    new = sorted(set(frames_now).difference(known))
     if new:
         yield f"{len(new)} new frames ({new[0]}, …)" if len(new) > 1 else f"a new frame ({new[0]})"
-    elif "frames" in digests and len(frames_now) == len(known):
-        stamps = zip(frames_now, stamps_of(flight.frames_folder, frames_now), strict=True)
-        sizes = {frame: None if stamp is None else stamp[0] for frame, stamp in stamps}
-        if digest(sizes) != digests["frames"]:
-            yield "files of frames"
+        return
+    sizes_then = dict(zip(known, _values(metadata, b"kgcp.frame_bytes"), strict=False))
+    stamps = zip(frames_now, stamps_of(flight.frames_folder, frames_now), strict=True)
+    sizes_now = {frame: None if stamp is None else stamp[0] for frame, stamp in stamps}
+    changed = [frame for frame, size in sizes_now.items() if sizes_then.get(frame, size) != size]
+    if changed:
+        more = ", …" if len(changed) > 1 else ""
+        yield f"files of {counted(len(changed), 'frame')} ({changed[0]}{more})"
