@@ -164,8 +164,18 @@ def _cache_of(out: StoredFolder) -> Path:
     """Return the folder of this machine in which results of a store are made.
 
     It is the same for every run, so that the journal of one that was interrupted is found again.
+
+    Raises
+    ------
+    KgcpError
+        If the user has no home, as in some containers.
     """
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    try:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError as error:
+        raise KgcpError(
+            "the user has no home folder; set XDG_CACHE_HOME to a folder with space for the results"
+        ) from error
     return base / "kgcp" / hashlib.sha256(str(out).encode()).hexdigest()[:16]
 
 

@@ -62,3 +62,15 @@ def test_the_folder_of_results_that_are_not_uploaded_is_named(
         text = str(error.value)
     (result,) = (tmp_path / "cache").rglob("detections.parquet")
     assert str(result.parent) in text
+
+
+def test_a_user_without_a_home_needs_a_folder_for_results(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", home)
+    with pytest.raises(KgcpError, match="no home folder; set XDG_CACHE_HOME"):
+        write_results(tmp_path)
