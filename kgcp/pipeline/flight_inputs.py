@@ -19,6 +19,7 @@ from kgcp.georef.prediction import reference_states
 from kgcp.georef.sighting import Attempt, Sighting
 from kgcp.georef.target_positions import TargetPositions
 from kgcp.georef.trajectory import Trajectory
+from kgcp.io.files.safe_read import is_missing
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.frame_times import FrameTimes
@@ -355,7 +356,7 @@ def missing_files(flight: Flight) -> tuple[Doubt, ...]:
             "put it there or correct flight.toml",
         )
         for file, key, command in named
-        if not file.exists()
+        if is_missing(file)
     )
 
 

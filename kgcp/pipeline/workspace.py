@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from kgcp.errors import KgcpError, KgcpWarning
+from kgcp.io.files.safe_read import is_missing
 from kgcp.io.flight.flight import Flight
 from kgcp.io.images.frames import FRAME_SUFFIXES, RESULTS_NAME
 from kgcp.io.images.remote import StoredFolder
@@ -33,7 +34,7 @@ def results_folder(flight: Path) -> Path:
         If there is such a link.
     """
     folder = flight / RESULTS_NAME
-    if folder.is_symlink():
+    if os.path.islink(folder):  # noqa: PTH114 - Path.is_symlink raises in a protected folder
         raise KgcpError(
             f"{folder}: is a link; delete it, or use its destination as the results folder",
             option="out",
@@ -74,7 +75,7 @@ class Workspace:
             If it is not there, but in the folder in which results usually are.
         """
         table, usual = self.out / DETECTIONS, self.flight / RESULTS_NAME / DETECTIONS
-        if named is None and not table.exists() and usual.exists():
+        if named is None and is_missing(table) and not is_missing(usual):
             raise KgcpError(
                 f"{table}: does not exist; name the table that lies in the flight's folder",
                 option=f"detections {usual}",

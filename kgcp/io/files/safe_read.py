@@ -7,6 +7,7 @@ a limit, so that nothing can block the program or fill the memory.
 from __future__ import annotations
 
 import codecs
+import errno
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +20,7 @@ MOST_BYTES = 1 << 29
 _LONGEST_LINE = 1 << 20  # characters
 _HEAD = 4096  # bytes that tell an encoding
 _UNTOLD = 1 << 20  # bytes, where the system does not tell
+_REFUSED_NAMES = {errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL}
 LARGEST = 1e15
 """What no coordinate, angle, time or parameter reaches: more of it would overflow somewhere."""
 
@@ -31,6 +33,26 @@ def is_file(path: Path) -> bool:
 def is_folder(path: Path) -> bool:
     """Return whether this is a folder; names that the system refuses are none."""
     return os.path.isdir(path)  # noqa: PTH112 - as above
+
+
+def is_missing(path: Path) -> bool:
+    """Return whether nothing has this name; names that the system refuses name nothing.
+
+    It returns False also if the system cannot tell, as in a protected folder or on a network drive
+    that is gone. Reading the file then says why.
+    """
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError, ValueError):
+        return True
+    except OSError as error:
+        return error.errno in _REFUSED_NAMES
+    return False
+
+
+def is_no_file(path: Path) -> bool:
+    """Return whether a name is known to be no regular file's; see `is_missing`."""
+    return not is_file(path) and (os.path.lexists(path) or is_missing(path))
 
 
 def is_sound(value: float) -> bool:
@@ -70,6 +92,11 @@ def require_file(path: Path, toml_key: str) -> None:
     """
     if is_file(path):
         return
+    if not is_missing(path):
+        try:
+            path.stat()
+        except OSError as error:
+            raise unreadable(path, error, f"correct {toml_key}") from error
     problem = "is not a regular file" if os.path.lexists(path) else "does not exist"
     raise KgcpError(f"{path}: {problem}; flight.toml names it under {toml_key}")
 

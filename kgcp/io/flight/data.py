@@ -9,6 +9,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.georef.target_positions import TargetPositions
 from kgcp.georef.trajectory import Trajectory
+from kgcp.io.files.safe_read import is_missing
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.frame_times import FrameTimes, read_times
 from kgcp.io.formats.orientations import read_reference_poses
@@ -38,13 +39,13 @@ class FlightData:
     def has_reference(self) -> bool:
         """Whether flight.toml names reference poses that exist."""
         reference = self._flight.reference
-        return reference is not None and reference.file.exists()
+        return reference is not None and not is_missing(reference.file)
 
     @property
     def has_trajectory(self) -> bool:
         """Whether flight.toml names a trajectory that exists."""
         vehicle = self._flight.vehicle
-        return vehicle is not None and vehicle.trajectory_file.exists()
+        return vehicle is not None and not is_missing(vehicle.trajectory_file)
 
     def has_position_of(self, target: AnyTarget) -> bool:
         """Tell whether a target has a position, or the files that its position is computed from."""

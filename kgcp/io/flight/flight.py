@@ -10,7 +10,7 @@ from pathlib import Path
 from kgcp.errors import KgcpError
 from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.geometry.camera import Camera
-from kgcp.io.files.safe_read import is_file, is_folder, remedy_for_missing
+from kgcp.io.files.safe_read import is_file, is_folder, is_no_file, remedy_for_missing
 from kgcp.io.flight.camera_table import (
     CAMERA_KEYS,
     read_calibration_covariance,
@@ -195,7 +195,7 @@ def _read_flight_toml(folder: Path) -> tuple[TomlTable, str]:
     path = folder / "flight.toml"
     if is_file(folder):
         raise KgcpError(f"{folder}: is a file; name the flight folder, which has a flight.toml")
-    if not is_file(path):
+    if is_no_file(path):
         remedy = "name a flight folder, which has a flight.toml ('kgcp init' writes one)"
         raise KgcpError(f"{path}: does not exist; {remedy_for_missing(path, remedy)}")
     return read_toml(path, FLIGHT_KEYS, "FLIGHT")

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from kgcp.errors import KgcpError, SettingError
-from kgcp.io.files.safe_read import LARGEST, is_file, remedy_for_missing
+from kgcp.io.files.safe_read import LARGEST, is_file, is_missing, remedy_for_missing
 
 Value = TypeVar("Value")
 Word = TypeVar("Word", bound=str)
@@ -170,13 +170,14 @@ class TomlTable:
         return text
 
     def existing_file(self, key: str, folder: Path) -> Path:
-        """Return a file that lies in the folder or below it."""
+        """Return a file that lies in the folder or below it; reading says if it is protected."""
         path = folder / self.path(key, folder)
         if not is_file(path):
             if os.path.lexists(path):
                 raise self.error(key, f"{self.text(key)!r} is not a regular file", "name a file")
-            remedy = remedy_for_missing(path, "create or correct it")
-            raise self.error(key, f"{self.text(key)!r} does not exist", remedy)
+            if is_missing(path):
+                remedy = remedy_for_missing(path, "create or correct it")
+                raise self.error(key, f"{self.text(key)!r} does not exist", remedy)
         return path
 
     def vector(

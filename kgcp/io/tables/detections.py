@@ -19,7 +19,7 @@ from kgcp.errors import KgcpError, Status
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import Pose
 from kgcp.georef.sighting import Attempt, Exposure, Sighting
-from kgcp.io.files.safe_read import is_file
+from kgcp.io.files.safe_read import is_no_file
 from kgcp.io.flight.flight import Flight
 from kgcp.io.tables.columns import (
     BOOLEAN,
@@ -214,7 +214,7 @@ def read_detections(path: Path | str, *, status: str | None = None) -> pd.DataFr
         If the table is missing, unreadable or damaged, or the status is unknown.
     """
     path = Path(path)
-    if not is_file(path):
+    if is_no_file(path):
         raise KgcpError(f"{path}: does not exist; run 'kgcp detect' on this flight first")
     if status is not None and status not in set(Status):
         raise KgcpError(f"status {status!r}: is unknown; give one of {', '.join(Status)}")

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 
 from kgcp.errors import KgcpError
 from kgcp.io.files.atomic import unwritable, whole_file
-from kgcp.io.files.safe_read import is_file, unreadable
+from kgcp.io.files.safe_read import is_no_file, unreadable
 from kgcp.io.tables.columns import SCHEMA_VERSION, Column, ColumnType, Row
 
 if TYPE_CHECKING:  # 0.3 s that writing does not need
@@ -82,7 +82,7 @@ def read_table(path: Path, columns: Sequence[Column[Any]]) -> pd.DataFrame:
         If the file is missing, not Parquet, of another version, lacks declared columns, or has them
         with another type, twice, or with null in a key.
     """
-    if not is_file(path):
+    if is_no_file(path):
         raise KgcpError(f"{path}: does not exist; run the command that writes it first")
     try:
         table = pq.read_table(path)

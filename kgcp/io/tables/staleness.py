@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
+from kgcp.io.files.safe_read import unreadable
 from kgcp.io.files.time_text import format_time
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
@@ -49,10 +50,12 @@ def refuse_to_replace_whole(path: Path) -> None:
     Raises
     ------
     KgcpError
-        If the table has all frames of its flight.
+        If the table has all frames of its flight, or is protected.
     """
     try:
         metadata = pq.read_schema(path).metadata or {}
+    except PermissionError as error:
+        raise unreadable(path, error, "make it readable") from error
     except (OSError, pa.ArrowException):  # no table, or a damaged one
         return
     if b"kgcp.inputs" in metadata and b"kgcp.choice" not in metadata:

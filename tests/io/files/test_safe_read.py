@@ -7,10 +7,21 @@ from pathlib import Path
 import pytest
 
 from kgcp.errors import KgcpError, one_line
-from kgcp.io.files.safe_read import is_file, is_folder, is_sound, read_bytes, read_lines
+from kgcp.io.files.safe_read import (
+    is_file,
+    is_folder,
+    is_missing,
+    is_sound,
+    read_bytes,
+    read_lines,
+)
 from kgcp.io.files.safe_yaml import load_yaml
 from kgcp.io.files.sniff import ForeignFile
+from kgcp.io.flight.data import FlightData
+from kgcp.io.flight.flight import read_flight
+from kgcp.io.tables.detections import read_detections
 from kgcp.io.tables.parquet import read_table
+from kgcp.io.tables.staleness import refuse_to_replace_whole
 from kgcp.pipeline.workspace import results_folder
 from tests.systems import needs_links, not_on_windows, share
 
@@ -87,6 +98,53 @@ def test_a_file_that_another_program_has_is_reported(
     ):
         with pytest.raises(KgcpError, match=r"is protected, or open in another program; make it"):
             read()
+
+
+@pytest.fixture
+def hidden(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder that another user may not enter; it hides even which files it has."""
+    folder, ask = tmp_path / "hidden", os.stat
+
+    def refuse(
+        path: str | Path | int, *, dir_fd: int | None = None, follow_symlinks: bool = True
+    ) -> os.stat_result:
+        if str(path).startswith(str(folder)):
+            raise PermissionError(13, "Permission denied", str(path))
+        return ask(path, dir_fd=dir_fd, follow_symlinks=follow_symlinks)
+
+    monkeypatch.setattr("os.stat", refuse)
+    monkeypatch.setattr("pyarrow.parquet.read_table", refuse)
+    monkeypatch.setattr("pyarrow.parquet.read_schema", refuse)
+    return folder
+
+
+def test_a_file_in_a_protected_folder_is_not_missing(hidden: Path) -> None:
+    assert not is_missing(hidden / "file")
+    for name in ("gone", "n" * 5000, "a\0b"):
+        assert is_missing(hidden.parent / name)
+    assert not is_missing(hidden.parent)
+    for read in (
+        lambda: read_bytes(hidden / "file", KEY),
+        lambda: read_detections(hidden / "detections.parquet"),
+        lambda: read_flight(hidden),
+        lambda: refuse_to_replace_whole(hidden / "detections.parquet"),
+    ):
+        with pytest.raises(KgcpError, match=r"is protected, or open in another program; make it"):
+            read()
+
+
+def test_files_in_a_protected_folder_are_not_ignored(hidden: Path) -> None:
+    sample = Path(__file__).parents[3] / "sample_flight"
+    text = (sample / "flight.toml").read_text("utf-8").replace('folder = "frames"', "")
+    for name in ("frames", "vehicle", "reference"):
+        text = text.replace(f'"{name}.csv"', f'"hidden/{name}.csv"')
+    (hidden.parent / "frames").mkdir()
+    (hidden.parent / "flight.toml").write_text(text, "utf-8")
+    data = FlightData(read_flight(hidden.parent), [])
+    assert data.has_reference
+    assert data.has_trajectory
+    with pytest.raises(KgcpError, match=r"frames\.csv: is protected"):
+        _ = data.frame_times
 
 
 def test_numbers_are_sound_up_to_what_could_overflow() -> None:
