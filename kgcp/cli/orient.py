@@ -212,12 +212,13 @@ def _orient_by_device(
     as_json: bool,
 ) -> None:
     from kgcp.errors import KgcpError
+    from kgcp.io.files.safe_read import is_no_file
     from kgcp.io.flight.device_file import read_device
     from kgcp.io.flight.flight import read_flight
     from kgcp.pipeline.ground.device import orient_frames_by_device, write_device_poses
     from kgcp.pipeline.workspace import results_folder
 
-    if not device_file.is_file():
+    if is_no_file(device_file):
         raise KgcpError(f"{device_file}: does not exist; name a device's file", option="device")
     device, the_flight = read_device(device_file), read_flight(flight)
     made = orient_frames_by_device(the_flight, device, patterns, has_free_focal=free_focal)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -120,7 +121,7 @@ def write_draft(draft: FlightDraft, folder: Path) -> list[Path]:
 
 def _require_new(folder: Path) -> None:
     path = folder / FLIGHT_TOML
-    if path.exists() or path.is_symlink():
+    if os.path.lexists(path):
         raise KgcpError(
             f"{path}: exists and is not replaced; edit it, or move it away and repeat 'kgcp init'"
         )

@@ -6,6 +6,7 @@ import functools
 import io
 import json
 import math
+import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -23,6 +24,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.io.files.csv_text import csv_text
 from kgcp.io.files.portable import replace
+from kgcp.io.files.safe_read import is_folder
 from kgcp.io.files.time_text import format_time
 from kgcp.io.flight.camera_file import camera_lines
 from kgcp.io.flight.target_table import target_lines
@@ -166,7 +168,7 @@ def new_folder(out: Path) -> Iterator[Path]:
         If `out` is not empty, cannot be written, or is the current folder.
     """
     out = out.resolve()
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if os.path.lexists(out) and (not is_folder(out) or any(out.iterdir())):
         raise KgcpError(f"{out}: is not empty; choose a new folder or empty it first")
     if out == Path.cwd():  # Windows keeps it, and a shell elsewhere would see an empty folder
         raise KgcpError(f"{out}: is the current folder; choose a new folder")

@@ -15,7 +15,7 @@ from click.testing import CliRunner
 from kgcp import __version__
 from kgcp.cli import COMMANDS, Program, main
 from kgcp.errors import KgcpError, KgcpWarning
-from tests.cli.conftest import SampleFlight
+from tests.cli.conftest import SAMPLE, SampleFlight
 
 HEAVY = {"cv2", "jinja2", "matplotlib", "numpy", "pandas", "PIL", "pyarrow", "pyproj", "scipy"}
 
@@ -199,3 +199,18 @@ def test_help_loads_no_heavy_library_and_is_quick() -> None:
     seconds = time.perf_counter() - start
     assert not HEAVY & set(done.stdout.split())
     assert seconds < 2.0  # 0.2 s on an idle machine; loose, as tests share theirs
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        (("orient", str(SAMPLE), "--device", "{}/d.toml"), "d.toml: is protected, or open in"),
+        (("simulate", "{}/flight", "--frames", "1"), "flight: cannot be written"),
+    ],
+)
+def test_a_protected_folder_is_one_line(
+    hidden: Path, arguments: tuple[str, ...], problem: str
+) -> None:
+    result = CliRunner().invoke(main, [argument.format(hidden) for argument in arguments])
+    assert result.exit_code == 1
+    assert problem in result.stderr.splitlines()[-1]

@@ -19,6 +19,7 @@ from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.io.exporters.points import MapPoints
 from kgcp.io.files.atomic import write_all
+from kgcp.io.files.safe_read import is_missing, is_no_file
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.orientations import read_reference_poses
@@ -298,8 +299,8 @@ def _poses(
 ) -> ReferencePoses:
     if file is None:
         return data.reference_poses
-    if not file.is_file():
-        problem = "is no file" if file.exists() else "does not exist"
+    if is_no_file(file):
+        problem = "does not exist" if is_missing(file) else "is no file"
         raise KgcpError(f"{file}: {problem}; name a file of poses", option="poses")
     return read_reference_poses(file, crs=flight.crs, frames=sorted(set(frames)))
 

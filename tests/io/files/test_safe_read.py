@@ -100,24 +100,6 @@ def test_a_file_that_another_program_has_is_reported(
             read()
 
 
-@pytest.fixture
-def hidden(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder that another user may not enter; it hides even which files it has."""
-    folder, ask = tmp_path / "hidden", os.stat
-
-    def refuse(
-        path: str | Path | int, *, dir_fd: int | None = None, follow_symlinks: bool = True
-    ) -> os.stat_result:
-        if str(path).startswith(str(folder)):
-            raise PermissionError(13, "Permission denied", str(path))
-        return ask(path, dir_fd=dir_fd, follow_symlinks=follow_symlinks)
-
-    monkeypatch.setattr("os.stat", refuse)
-    monkeypatch.setattr("pyarrow.parquet.read_table", refuse)
-    monkeypatch.setattr("pyarrow.parquet.read_schema", refuse)
-    return folder
-
-
 def test_a_file_in_a_protected_folder_is_not_missing(hidden: Path) -> None:
     assert not is_missing(hidden / "file")
     for name in ("gone", "n" * 5000, "a\0b"):
