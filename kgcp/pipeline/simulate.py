@@ -23,6 +23,7 @@ from PIL.TiffImagePlugin import IFDRational
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.io.files.csv_text import csv_text
+from kgcp.io.files.locks import lock_file
 from kgcp.io.files.portable import replace
 from kgcp.io.files.safe_read import is_folder
 from kgcp.io.files.time_text import format_time
@@ -165,7 +166,8 @@ def new_folder(out: Path) -> Iterator[Path]:
     Raises
     ------
     KgcpError
-        If `out` is not empty, cannot be written, or is the current folder.
+        If `out` is not empty, cannot be written, is the current folder, or is being written by
+        another process.
     """
     out = out.resolve()
     if os.path.lexists(out) and (not is_folder(out) or any(out.iterdir())):
@@ -174,16 +176,23 @@ def new_folder(out: Path) -> Iterator[Path]:
         raise KgcpError(f"{out}: is the current folder; choose a new folder")
     partial = out.with_name(f".{out.name}.part")
     try:
-        shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed
-        partial.mkdir(parents=True)
-        yield partial
-        if out.exists():
-            out.rmdir()
-        replace(partial, out)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with lock_file(out.with_name(f".{out.name}.lock")):
+            try:
+                shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed
+                partial.mkdir()
+                yield partial
+                if out.exists():
+                    out.rmdir()
+                replace(partial, out)
+            finally:
+                shutil.rmtree(partial, ignore_errors=True)
+    except BlockingIOError as error:
+        raise KgcpError(
+            f"{out}: another kgcp is writing it; wait until it ends, or choose another folder"
+        ) from error
     except OSError as error:
         raise KgcpError(f"{out}: cannot be written ({error}); choose another folder") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def render_all(

@@ -13,7 +13,7 @@ from kgcp.io.formats.orientations import read_reference_poses
 from kgcp.io.formats.trajectories import read_trajectory
 from kgcp.io.images.exif import read_exif
 from kgcp.io.images.frames import list_frames, read_grey
-from kgcp.pipeline.simulate import write_simulated_flight
+from kgcp.pipeline.simulate import new_folder, write_simulated_flight
 from kgcp.simulation.effects import Effects, with_effects
 from kgcp.simulation.flight import (
     CRS,
@@ -166,3 +166,15 @@ def test_a_folder_that_cannot_be_created_is_a_one_line_error(tmp_path: Path) -> 
     (tmp_path / "file").write_text("")
     with pytest.raises(KgcpError, match="cannot be written"):
         write(SMALL, tmp_path / "file" / "flight")
+
+
+def test_two_runs_do_not_write_one_folder(tmp_path: Path) -> None:
+    with new_folder(tmp_path / "new" / "flight") as partial:
+        (partial / "file").touch()
+        with (
+            pytest.raises(KgcpError, match=r"flight: another kgcp is writing it; wait"),
+            new_folder(tmp_path / "new" / "flight"),
+        ):
+            pass
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["flight"]
+    assert (tmp_path / "new" / "flight" / "file").exists()

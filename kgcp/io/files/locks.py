@@ -20,7 +20,7 @@ def is_at(path: Path, file: FileIO) -> bool:
 
 
 def open_locked(path: Path) -> FileIO:
-    """Open a file for writing, created if needed, that no other process has open.
+    """Open a result for writing, created if needed, that no other process has open.
 
     The kernel holds the lock, and releases it when the process ends in whatever way.
 
@@ -29,34 +29,45 @@ def open_locked(path: Path) -> FileIO:
     KgcpError
         If another process has it open, or it cannot be written.
     """
-    try:
+    with _known_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_symlink():
-            raise OSError(errno.ELOOP, "is a link; delete it")
-        while True:
-            flags = os.O_RDWR | os.O_CREAT | OPEN_FLAGS
-            with ExitStack() as stack:
-                file = stack.enter_context(FileIO(os.open(path, flags, 0o644), "r+"))
-                if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                    raise OSError(errno.EINVAL, "is not a file; delete it")
-                lock(file.fileno())
-                # another process may have deleted the file between opening and locking
-                if is_at(path, file):
-                    stack.pop_all()
-                    return file
-    except BlockingIOError as error:
-        raise KgcpError(
-            f"{path.parent}: another kgcp is writing here; wait until it ends, or choose another"
-            " results folder",
-            option="out",
-        ) from error
-    except OSError as error:
-        # an interrupted run can only be resumed here
-        remedy = "make it writable, or " if isinstance(error, PermissionError) else ""
-        raise KgcpError(
-            f"{path}: cannot be written ({error.strerror}); {remedy}choose another results folder",
-            option="out",
-        ) from error
+        return _locked(path)
+
+
+def _locked(path: Path) -> FileIO:
+    if path.is_symlink():
+        raise OSError(errno.ELOOP, "is a link; delete it")
+    while True:
+        flags = os.O_RDWR | os.O_CREAT | OPEN_FLAGS
+        with ExitStack() as stack:
+            file = stack.enter_context(FileIO(os.open(path, flags, 0o644), "r+"))
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise OSError(errno.EINVAL, "is not a file; delete it")
+            lock(file.fileno())
+            # another process may have deleted the file between opening and locking
+            if is_at(path, file):
+                stack.pop_all()
+                return file
+
+
+@contextmanager
+def lock_file(path: Path) -> Iterator[None]:
+    """Have a file of this name, locked against other processes, until the block ends.
+
+    Raises
+    ------
+    BlockingIOError
+        If another process has it.
+    OSError
+        If it cannot be written.
+    """
+    with _locked(path):
+        try:
+            yield
+        finally:
+            _delete(path)  # before its lock is released
+    if os.name == "nt":
+        _delete(path)
 
 
 @contextmanager
@@ -71,13 +82,30 @@ def sole_writer(folder: Path, command: str) -> Iterator[None]:
         If another run is writing there, or the folder cannot be written.
     """
     path = folder / f".{command}.lock"
-    with open_locked(path):
-        try:
-            yield
-        finally:
-            _delete(path)  # before its lock is released
-    if os.name == "nt":
-        _delete(path)
+    with ExitStack() as stack:
+        with _known_errors(path):
+            folder.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(lock_file(path))
+        yield
+
+
+@contextmanager
+def _known_errors(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except BlockingIOError as error:
+        raise KgcpError(
+            f"{path.parent}: another kgcp is writing here; wait until it ends, or choose another"
+            " results folder",
+            option="out",
+        ) from error
+    except OSError as error:
+        # an interrupted run can only be resumed here
+        remedy = "make it writable, or " if isinstance(error, PermissionError) else ""
+        raise KgcpError(
+            f"{path}: cannot be written ({error.strerror}); {remedy}choose another results folder",
+            option="out",
+        ) from error
 
 
 def _delete(path: Path) -> None:
