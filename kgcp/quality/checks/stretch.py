@@ -32,7 +32,7 @@ _STEP = 1e-4  # for numerical derivatives [rad, relative]
 _STRETCHES: FloatArray = 0.5 * np.array([[[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]])
 
 _PRINT, _IMAGES = "the print was", "the images were"
-_DIRECTIONS = {_PRINT: "of the plate, as code_deg counts", _IMAGES: "from x towards y"}
+_DIRECTIONS = {_PRINT: "counted like code_deg", _IMAGES: "counted from x towards y"}
 _REMEDIES = {
     _PRINT: "measure the ring's outer diameter in several directions, look for joints that do not"
     " fit, and print the target again if the ring is not round",
@@ -143,20 +143,22 @@ class _Views:
 def check_stretch(encounters: Encounters) -> Iterator[Doubt]:
     """Yield the doubt about a print or images that are stretched in one direction.
 
-    The images are not tested under a rolling shutter: there, the motion stretches them.
+    Images under a rolling shutter are not in doubt: there, the motion stretches them. Nor is the
+    print if stretched images explain the poses as well, as they do if the plate always has the same
+    heading in the image.
     """
     views = _Views.of(encounters)
     if len(views.measured) < _MIN_FRAMES:
         return
-    fits = {_PRINT: views.fit(is_image=False)}
-    if not encounters.camera.readout_s:
-        fits[_IMAGES] = views.fit(is_image=True)
+    fits = {_PRINT: views.fit(is_image=False), _IMAGES: views.fit(is_image=True)}
     found = {what: stretch for what, stretch in fits.items() if stretch.is_significant}
     if not found:
         return
     least = min(stretch.scatter for stretch in found.values())
     likely = {what: each for what, each in found.items() if each.scatter < _ALIKE * least}
-    words = " or ".join(f"{what} {each} {_DIRECTIONS[what]}" for what, each in likely.items())
+    if _IMAGES in likely and encounters.camera.readout_s:
+        return
+    words = ", or ".join(f"{what} {each}, {_DIRECTIONS[what]}" for what, each in likely.items())
     best = min(likely.values(), key=lambda each: each.scatter)
     yield mild(
         Cause.STRETCH,
