@@ -239,6 +239,7 @@ class DetectionRun:
                     self._keep(row, result)
                     sizes.add(result)
                     if sizes.wrong is not None:
+                        self._journal.remove()  # neither other frames nor another camera need it
                         raise KgcpError(
                             f"{self._job.frames_folder}: the first {FirstSizes.FRAMES} frames"
                             f" looked at are all {sizes.wrong}; {Reason.WRONG_SIZE.remedy}"

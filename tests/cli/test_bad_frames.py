@@ -113,8 +113,11 @@ def test_frames_of_another_size_end_the_run_early(flight: Path) -> None:
         " flight.toml the size and calibration of these frames"
     ) in line
     assert not (flight / "kgcp" / "detections.parquet").exists()
+    toml = (flight / "flight.toml").read_text("utf-8")
+    wider = toml.replace(f"width = {WIDTH}", f"width = {WIDTH + 1}")
+    (flight / "flight.toml").write_text(wider, "utf-8")
     line = one_line_of_error(run("detect", str(flight), "--jobs", "0"))
-    assert "the first 20 frames looked at are all 640 x 400 px" in line, "also when resumed"
+    assert "are all 640 x 400 px, the camera has 321 x 200" in line, "no --restart is needed"
 
 
 @pytest.mark.parametrize(

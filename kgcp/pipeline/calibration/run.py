@@ -226,14 +226,17 @@ def _calibrated(
         first = looks.through(
             "photographs", photos, [photo.name for photo in photos], partial(measure_photo, task)
         )
-        results = _without_duplicates(_of_one_camera(first))
-        views = _views(results)
-        start = calibrate_camera(
-            views,
-            field,
-            _size(results),
-            replace(options.settings, points=PointModel.FIXED, lens=LensModel.RADIAL),
-        )
+        try:
+            results = _without_duplicates(_of_one_camera(first))
+            start = calibrate_camera(
+                _views(results),
+                field,
+                _size(results),
+                replace(options.settings, points=PointModel.FIXED, lens=LensModel.RADIAL),
+            )
+        except KgcpError:  # its remedy changes the field, the response or the photographs
+            journal.remove()
+            raise
         results = _second_pass(looks, task, photos, results, start)
         final = calibrate_camera(_views(results), field, _size(results), options.settings, start)
     camera = replace(final.camera, response=options.response)
