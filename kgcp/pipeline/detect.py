@@ -413,11 +413,11 @@ def _stages_s(
 def _dependencies(job: DetectionJob) -> dict[str, str]:
     """Return what the results of all frames depend on, so that a change can be named."""
     return {
-        "the version of kgcp or of a library": to_text(versions()),
-        "the settings": to_text(job.settings),
+        **{f"the version of {name}": value for name, value in versions().items()},
+        **{name: to_text(value) for name, value in asdict(job.settings).items()},
         "the camera": fingerprint(job.camera, job.calibration_covariance),
         "the targets": fingerprint(job.all_targets),
-        "what is shown of dropped rings": to_text(job.keeps_dropped),
+        "all_candidates": to_text(job.keeps_dropped),
     }
 
 

@@ -228,7 +228,7 @@ def test_what_changed_is_done_again(flight: Path, looks: Counter[str]) -> None:
     [
         (("fx = 900.0", "fx = 901.0"), 6.0, "the camera"),
         (("0, 43, 78", "0, 44, 78"), 6.0, "the targets"),
-        (("", ""), 7.0, "the settings"),
+        (("", ""), 7.0, r"min_radius_px \(was 6\.0\)"),
     ],
 )
 def test_a_change_of_what_all_depends_on_loses_nothing(
@@ -237,7 +237,7 @@ def test_a_change_of_what_all_depends_on_loses_nothing(
     stop(flight, 3)
     text = (flight / "flight.toml").read_text(encoding="utf-8")
     (flight / "flight.toml").write_text(text.replace(*edit), encoding="utf-8")
-    with pytest.raises(KgcpError, match=rf"run, and {what} changed since; undo this to resume"):
+    with pytest.raises(KgcpError, match=rf"run; changed since: {what}; undo this to resume"):
         detect(flight, min_radius_px=min_radius_px)
     (flight / "flight.toml").write_text(text, encoding="utf-8")
     detect(flight)

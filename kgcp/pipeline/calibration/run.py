@@ -40,7 +40,7 @@ from kgcp.pipeline.calibration.photographs import (
 )
 from kgcp.pipeline.detection_run import ProgressListener
 from kgcp.pipeline.execution.executor import WorkerPool, open_pool
-from kgcp.pipeline.execution.journal import Journal, fingerprint, to_text
+from kgcp.pipeline.execution.journal import Journal, fingerprint
 from kgcp.pipeline.execution.resilient_map import TaskFailure
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.targets.fields.naming import NamingProblem
@@ -199,9 +199,10 @@ def calibrated_photos(
         If the photographs are by several cameras, or fewer than three can be used.
     """
     making = {
-        "the version of kgcp or of a library": to_text(versions()),
+        **{f"the version of {name}": value for name, value in versions().items()},
         "the field": fingerprint(field),
-        "the operator or the response": fingerprint(options.response, options.operator),
+        "the response": options.response.value,
+        "the operator": options.operator.value,
     }
     kinds: tuple[type[PhotoDiscs | PhotoMiss], ...] = (PhotoDiscs, PhotoMiss)
     path, is_new = out / ".calibration.journal", options.is_restart

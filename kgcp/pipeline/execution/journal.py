@@ -59,6 +59,7 @@ _MIN_FLUSH_INTERVAL_S = 1.0
 # at most 1 % of the time.
 _FLUSH_INTERVAL_RATIO = 100
 _MAX_LINE_BYTES = 1 << 26  # longer lines are no results
+_MAX_SHOWN = 20  # characters of a former value in a message
 
 
 def to_text(value: object) -> str:
@@ -136,9 +137,9 @@ class Journal(Generic[Result]):
     Parameters
     ----------
     path : Path
-        The file; it and its folder are made if need be. What was made otherwise is deleted.
+        The file; it and its folder are made if need be.
     making : mapping of str
-        What results are made with: name, for messages, to value.
+        What results are made with: name to value, which messages show if it is short.
     kinds : tuple of type
         Records that a result may be.
     is_new : bool
@@ -265,10 +266,14 @@ class Journal(Generic[Result]):
         """Refuse to empty a journal whose results would be kept if a change were undone."""
         results = sum(1 for _ in self)
         if made_by and results:
-            changes = ", ".join(key for key in making if made_by.get(key) != making[key])
+            changes = [
+                f"{key}{_shown(made_by.get(key))}"
+                for key, value in making.items()
+                if made_by.get(key) != value
+            ]
             raise KgcpError(
-                f"{self._path}: has {counted(results, 'result')} of an interrupted run, and"
-                f" {changes} changed since; undo this to resume, or start over",
+                f"{self._path}: has {counted(results, 'result')} of an interrupted run; changed"
+                f" since: {', '.join(changes)}; undo this to resume, or start over",
                 option="restart",
             )
 
@@ -316,6 +321,11 @@ class Journal(Generic[Result]):
             ) from error
         finally:
             self.seconds += time.monotonic() - began_s
+
+
+def _shown(value: str | None) -> str:
+    """Return the former value of something that has changed, unless it is long, as digests are."""
+    return f" (was {value})" if value is not None and len(value) <= _MAX_SHOWN else ""
 
 
 def results_in(path: Path) -> set[str]:

@@ -183,7 +183,8 @@ def test_results_are_found_by_those_who_come_later(tmp_path: Path) -> None:
 
 def test_results_that_were_made_with_something_else_are_not_lost(tmp_path: Path) -> None:
     fill(tmp_path, 1)
-    with pytest.raises(KgcpError, match="1 result of an interrupted run, and the camera changed"):
+    text = r"1 result of an interrupted run; changed since: the camera \(was .\); undo this"
+    with pytest.raises(KgcpError, match=text):
         open_journal(tmp_path, camera="c")
     with open_journal(tmp_path) as journal:
         assert journal.read("key-0").frame == "0"
