@@ -12,7 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
@@ -91,6 +91,24 @@ def peak_memory_mb() -> dict[str, float]:
     # macOS counts bytes, Linux kilobytes
     unit = _BYTES_PER_KB**2 if sys.platform == "darwin" else _BYTES_PER_KB
     return {name: resource.getrusage(each).ru_maxrss / unit for name, each in who.items()}
+
+
+def raised_limit_of_open_files(needed: int) -> int:
+    """Let this process have more files open, if the system permits it; return the limit.
+
+    macOS allows 256 unless a process asks for more. Windows has no such limit.
+    """
+    resource = _module("resource")
+    if resource is None:
+        return needed
+    allowed, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if allowed == resource.RLIM_INFINITY:
+        return needed
+    if allowed < needed:
+        with suppress(OSError, ValueError):  # beyond `most`, or what the kernel allows
+            resource.setrlimit(resource.RLIMIT_NOFILE, (needed, most))
+            return needed
+    return int(allowed)
 
 
 def scratch_file() -> IO[bytes]:

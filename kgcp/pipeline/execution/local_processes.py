@@ -11,7 +11,6 @@ with the system's libraries, and each process loads everything.
 
 from __future__ import annotations
 
-import errno
 import multiprocessing
 import os
 import pickle
@@ -28,6 +27,7 @@ from multiprocessing.connection import wait
 from typing import Any
 
 from kgcp.errors import KgcpError
+from kgcp.io.files.portable import raised_limit_of_open_files
 from kgcp.pipeline.execution.resilient_map import Lost, TaskFailure
 from kgcp.pipeline.execution.signals import defer_interrupts
 from kgcp.pipeline.execution.threads import use_one_thread_each
@@ -39,6 +39,7 @@ else:
     _CONTEXT = multiprocessing.get_context("spawn")
 _Connection = Any  # of multiprocessing: `Connection`, or `PipeConnection` on Windows
 _MAX_STARTS = 3  # attempts to start a process
+_FILES_PER_PROCESS, _OTHER_FILES = 4, 64  # that this process has open at most
 _MAX_WAIT_S = 1e6  # longest timeout that the kernel accepts
 
 
@@ -186,8 +187,8 @@ class WorkerProcess:
 
     def _start(self) -> _Connection:
         for _ in range(_MAX_STARTS):
+            parent_end, child_end = _CONTEXT.Pipe()
             try:
-                parent_end, child_end = _CONTEXT.Pipe()
                 with self._lock:
                     if self._is_ended:
                         raise Lost(TaskFailure.CRASHED)
@@ -202,16 +203,10 @@ class WorkerProcess:
                 parent_end.recv()  # the process has started, which does not count as work
                 if self._preparation is not None:
                     self._prepare(parent_end, self._preparation)
-            except (EOFError, OSError, Lost) as error:
+            except (EOFError, OSError, Lost):
                 self._kill()
                 if self._is_ended:
                     raise Lost(TaskFailure.CRASHED) from None
-                if isinstance(error, OSError) and error.errno == errno.EMFILE:
-                    raise KgcpError(
-                        "worker processes cannot be started (too many open files); raise the"
-                        " limit (ulimit -n), or use fewer of them",
-                        option="jobs",
-                    ) from error
             except BaseException:
                 self._kill()
                 raise
@@ -286,9 +281,22 @@ class SupervisedProcessPool(ThreadPoolExecutor):
     ----------
     limit_s : float
         Time limit for one call [s].
+
+    Raises
+    ------
+    KgcpError
+        If the system does not allow as many open files as the processes need.
     """
 
     def __init__(self, jobs: int, limit_s: float, preparation: Preparation | None = None) -> None:
+        needed = _FILES_PER_PROCESS * jobs + _OTHER_FILES
+        allowed = raised_limit_of_open_files(needed)
+        if allowed < needed:
+            raise KgcpError(
+                f"{jobs} worker processes need more open files than the system allows ({allowed});"
+                " raise this limit (ulimit -n), or use fewer processes",
+                option="jobs",
+            )
         super().__init__(jobs)
         self._workers = [WorkerProcess(limit_s, preparation) for _ in range(jobs)]
         self._idle = list(self._workers)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import multiprocessing
 import os
 import signal
@@ -252,13 +251,22 @@ def test_processes_that_cannot_start_are_a_one_line_error(monkeypatch: pytest.Mo
     assert caught.value.on_command_line().endswith(" (--jobs 0)")
 
 
+@not_on_windows("has no limit of open files")
 def test_a_limit_of_open_files_is_a_one_line_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    def pipe() -> None:
-        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+    import resource
 
-    monkeypatch.setattr("kgcp.pipeline.execution.local_processes._CONTEXT.Pipe", pipe)
-    with pytest.raises(KgcpError, match=r"cannot be started \(too many open files\)"):
-        WorkerProcess(LIMIT_S).call(abs, 1)
+    asked: list[tuple[int, int]] = []
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (100, 200))
+    monkeypatch.setattr(resource, "setrlimit", lambda _, limits: asked.append(limits))
+    SupervisedProcessPool(20, LIMIT_S).shutdown()
+    assert asked == [(144, 200)]
+
+    def refuse(*_: object) -> None:
+        raise ValueError("current limit exceeds maximum limit")
+
+    monkeypatch.setattr(resource, "setrlimit", refuse)
+    with pytest.raises(KgcpError, match=r"80 worker processes need more open files .* \(100\)"):
+        SupervisedProcessPool(80, LIMIT_S)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a server of processes")
