@@ -11,7 +11,7 @@ import pandas as pd
 
 from kgcp.errors import KgcpError
 from kgcp.georef.camera_priors import CameraPrior, camera_priors
-from kgcp.georef.gcp import Gcp, SkippedSighting, build_gcps, transform_gcps
+from kgcp.georef.gcp import Gcp, SkippedSighting, SkipReason, build_gcps, transform_gcps
 from kgcp.georef.local_frame import CrsTransform
 from kgcp.georef.selection import Selection, exclude, explain_empty_selection, select
 from kgcp.georef.sighting import Attempt, Sighting
@@ -112,6 +112,12 @@ def make_gcps(
     with naming_causes(inputs.plausibility):
         target_positions = data.target_positions
         placed, absent = build_gcps(sightings, target_positions, flight.camera)
+    if not placed and {each.reason for each in absent} == {SkipReason.SECOND_PLATE}:
+        raise KgcpError(
+            f"{table}: every frame with a target shows several plates of its code, so that none is"
+            " known to be the target; give each vehicle a code of its own, or cover the other"
+            " plates in the frames"
+        )
     local_frame = target_positions.local_frame
     gcps, unwanted = select(placed, sightings, local_frame, flight.camera, selection)
     if placed and not gcps:

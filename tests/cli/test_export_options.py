@@ -221,6 +221,16 @@ def test_gates_spacing_and_check_points_select_points(folder: Path) -> None:
     assert "no points left" in strict.stderr
 
 
+def test_two_plates_of_one_code_in_every_frame_are_named(folder: Path) -> None:
+    table = folder / "kgcp" / "detections.parquet"
+    rows = pq.read_table(table).to_pylist()
+    both = [{**row, "instance": instance} for row in rows for instance in (0, 1)]
+    write_table(table, DETECTION_COLUMNS, both, {})
+    result = CliRunner().invoke(main, ["export-gcp", str(folder)])
+    assert result.exit_code == 1
+    assert f"{table}: every frame with a target shows several plates" in result.stderr
+
+
 def test_points_exported_in_another_crs_are_the_same_places(folder: Path) -> None:
     _export(folder)
     path = folder / "kgcp" / "kgcps.parquet"
