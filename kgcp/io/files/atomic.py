@@ -95,9 +95,11 @@ def unwritable(path: Path, error: OSError) -> KgcpError:
     """
     if error.errno in {errno.ENOSPC, errno.EDQUOT}:
         return KgcpError(f"{path}: no space left; make room, then repeat the command")
-    remedy = "make the folder writable, or " if error.errno == errno.EACCES else ""
+    remedy = "make the folder writable, or " if isinstance(error, PermissionError) else ""
     return KgcpError(
-        f"{path}: cannot be written ({error}); {remedy}choose another results folder", option="out"
+        f"{path}: cannot be written ({error.strerror or error}); {remedy}choose another results"
+        " folder",
+        option="out",
     )
 
 

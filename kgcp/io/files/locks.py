@@ -11,6 +11,7 @@ from io import FileIO
 from pathlib import Path
 
 from kgcp.errors import KgcpError
+from kgcp.io.files.atomic import unwritable
 from kgcp.io.files.portable import OPEN_FLAGS, lock
 
 
@@ -100,12 +101,7 @@ def _known_errors(path: Path) -> Iterator[None]:
             option="out",
         ) from error
     except OSError as error:
-        # an interrupted run can only be resumed here
-        remedy = "make it writable, or " if isinstance(error, PermissionError) else ""
-        raise KgcpError(
-            f"{path}: cannot be written ({error.strerror}); {remedy}choose another results folder",
-            option="out",
-        ) from error
+        raise unwritable(path, error) from error
 
 
 def _delete(path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
@@ -24,13 +26,19 @@ def test_one_run_of_a_command_writes_at_a_time(tmp_path: Path) -> None:
     assert not [*folder.iterdir()]
 
 
-def test_a_protected_file_is_to_be_made_writable(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("number", "remedy"),
+    [
+        (errno.EACCES, "; make the folder writable, or choose another results folder"),
+        (errno.ENOSPC, "; make room, then repeat the command"),
+    ],
+)
+def test_a_lock_that_cannot_be_written_has_the_remedy_of_any_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, remedy: str
 ) -> None:
     def refuse(*_: object) -> int:
-        raise PermissionError(13, "Permission denied")
+        raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr("os.open", refuse)
-    text = r"journal: cannot be written \(Permission denied\); make it writable, or choose another"
-    with pytest.raises(KgcpError, match=text):
+    with pytest.raises(KgcpError, match=f"journal: .*{remedy}"):
         open_locked(tmp_path / "journal")
