@@ -187,7 +187,8 @@ def _of_camera(camera: Camera) -> Iterator[Slip]:
             Cause.DISTORTION,
             "camera",
             "the frames seem to be rectified, but the camera has distortion",
-            "give the raw frames, or the camera of the rectified ones in [camera]",
+            "if they are, give the raw frames, or name the camera of the rectified ones; if not,"
+            " look k1, k2 … up in the calibration",
             _with_camera(rectified),
         )
     mirrored = {

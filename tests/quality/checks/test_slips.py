@@ -231,6 +231,7 @@ def test_rectified_frames_are_recognised(encounters: Encounters) -> None:
     (doubt,) = causes_of(remeasured(rectified, barrel))
     assert doubt.code is Cause.DISTORTION
     assert "the frames seem to be rectified" in doubt.sentence
+    assert "if not, look k1, k2 … up" in doubt.remedy  # coefficients that are far too large
 
 
 def test_a_missing_distortion_is_recognised(encounters: Encounters) -> None:
