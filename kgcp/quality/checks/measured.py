@@ -22,6 +22,9 @@ from kgcp.quality.checks.static_targets import check_static_targets
 from kgcp.quality.checks.stretch import check_stretch
 from kgcp.quality.consistency import Consistency
 
+# Ratio of a disagreement to what a stretch explains, from which on it has another cause, too.
+_MIN_UNEXPLAINED_RATIO = 3.0
+
 
 def measured_doubts(
     plausibility: Sequence[Doubt],
@@ -63,10 +66,12 @@ def _of_encounters(encounters: Encounters, consistency: Consistency | None) -> I
         yield from causes
         return
     yield from check_mount(encounters)
-    stretch = tuple(check_stretch(encounters))
-    if stretch:  # corrections would compensate for it in part, and so be wrong
-        yield from stretch
-        return
+    for doubt in check_stretch(encounters):
+        yield doubt
+        distance_m = float(np.median(np.linalg.norm(encounters.in_camera_m, axis=1)))
+        explained_m = 0.5 * doubt.figures["stretch"] * distance_m
+        if encounters.apart_m < _MIN_UNEXPLAINED_RATIO * explained_m:
+            return  # corrections would compensate for the stretch, and so be wrong
     yield from check_lone_frames(encounters)
     if consistency is not None and is_correctable:
         for sentence, remedy in corrections(consistency):

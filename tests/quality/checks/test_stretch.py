@@ -101,6 +101,9 @@ def test_a_stretched_print_is_not_compensated_by_corrections(
     assert [doubt.code for doubt in _of_encounters(encounters, consistency)] == [Cause.CORRECTION]
     seen = seen_as(encounters, plate=stretched(20.0), image=np.eye(2))
     assert [doubt.code for doubt in _of_encounters(seen, consistency)] == [Cause.STRETCH]
+    far = replace(seen, lever_arm_m=np.add(seen.lever_arm_m, [0.3, 0.0, 0.0]))
+    both = [Cause.STRETCH, Cause.CORRECTION]
+    assert [doubt.code for doubt in _of_encounters(far, consistency)] == both
 
 
 @pytest.mark.parametrize("direction_deg", [0.0, 135.0])
