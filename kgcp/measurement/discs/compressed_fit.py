@@ -175,10 +175,13 @@ def noise_before_compression(fit: DiscFit, pixels: CompressedPixels | None) -> F
     """Return the noise (n,) as level that the pixels of a fit had before compression.
 
     It is the noise of the expected values before compression, plus their variance (Dempster, Laird
-    & Rubin, "Maximum likelihood from incomplete data via the EM algorithm", 1977).
+    & Rubin, "Maximum likelihood from incomplete data via the EM algorithm", 1977). Pixels whose
+    coefficients are not known are compared as they are, and have the noise after compression.
     """
+    after = noise_at(fit.sample, fit.state).sd
     if pixels is None:
-        return noise_at(fit.sample, fit.state).sd
+        return after
     levels, variance = pixels.levels_before(fit.sample.levels, fit.levels, fit.sd)
-    sd = noise_at(replace(fit.sample, levels=levels), fit.state).sd
-    return np.asarray(np.sqrt(sd**2 + variance))
+    sd = np.sqrt(noise_at(replace(fit.sample, levels=levels), fit.state).sd ** 2 + variance)
+    sd[pixels.outside_blocks] = after[pixels.outside_blocks]
+    return np.asarray(sd)

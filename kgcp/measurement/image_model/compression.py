@@ -46,6 +46,25 @@ _MIN_PERIODICITY = 0.6
 # `_MAX_ZERO` look like multiples.)
 _MIN_DETERMINED = 6
 _MIN_DETERMINED_SHARE = 0.55
+# The table that the JPEG standard proposes for grey values (ITU-T T.81, 1992, table K.1). Libjpeg,
+# and with it most programs, scales it by the quality. A scaled table is recognised if it agrees
+# with at least this share of the determined steps.
+_PROPOSED_STEPS = np.array(
+    (
+        (16, 11, 10, 16, 24, 40, 51, 61),
+        (12, 12, 14, 19, 26, 58, 60, 55),
+        (14, 13, 16, 24, 40, 57, 69, 56),
+        (14, 17, 22, 29, 51, 87, 80, 62),
+        (18, 22, 37, 56, 68, 109, 103, 77),
+        (24, 35, 55, 64, 81, 104, 113, 92),
+        (49, 64, 78, 87, 103, 121, 120, 101),
+        (72, 92, 95, 98, 112, 100, 103, 99),
+    )
+)
+_MIN_AGREEING_SHARE = 0.9
+# Largest difference between a block and what its coefficients decode to, if they are right. The
+# rounding of pixels makes 0.5, a decoder's integers a little more.
+_MAX_DECODING_ERROR_COUNTS = 1.1
 _MIN_SD_COUNTS = 0.3  # noise in grey values, due to quantisation alone
 _MIN_PROBABILITY = 1e-8  # of an interval; if it is smaller, only the nearer end counts
 _MIN_WEIGHT = 1e-9
@@ -56,8 +75,8 @@ def quantisation_steps(grey: GreyArray) -> FloatArray | None:
 
     They are in grey values of the orthonormal transform; the row is the vertical frequency. None is
     returned if the photograph was not compressed, if it was cropped or resized afterwards, or if
-    most steps are 1. Steps that cannot be determined are set to the largest step of lower
-    frequencies.
+    most steps are 1. If the determined steps are those of a usual table, the others are taken from
+    it. Otherwise, they are set to the largest step of lower frequencies.
     """
     height, width = (side // _SIDE * _SIDE for side in grey.shape)
     if grey.dtype != np.uint8 or not height or not width:
@@ -78,9 +97,32 @@ def quantisation_steps(grey: GreyArray) -> FloatArray | None:
     is_determinable = np.count_nonzero(size > _MAX_ZERO, axis=0) >= _MIN_COEFFICIENTS
     if np.count_nonzero(is_determined) < _MIN_DETERMINED_SHARE * np.count_nonzero(is_determinable):
         return None
+    usual = _usual_steps(steps[is_determined], is_determined)
+    if usual is not None:
+        return usual
     known = np.where(is_determined, steps, 1.0).reshape(_SIDE, _SIDE)
     lower = np.maximum.accumulate(np.maximum.accumulate(known, axis=0), axis=1)
     return np.where(is_determined.reshape(_SIDE, _SIDE), known, lower)
+
+
+def _usual_steps(determined: FloatArray, is_determined: BoolArray) -> FloatArray | None:
+    """Return the steps (8, 8) of the quality whose table agrees with some; None: none does.
+
+    Parameters
+    ----------
+    determined : (k,) array
+        The steps that are determined.
+    is_determined : (64,) array
+        Which steps these are.
+    """
+    qualities = np.arange(1, 101)
+    percent = np.where(qualities < 50, 5000 // qualities, 200 - 2 * qualities)
+    tables = np.clip((np.outer(percent, _PROPOSED_STEPS) + 50) // 100, 1, 255)
+    agreeing = np.mean(tables[:, is_determined] == determined, axis=1)
+    best = int(np.argmax(agreeing))
+    if agreeing[best] < _MIN_AGREEING_SHARE:
+        return None
+    return np.asarray(tables[best].reshape(_SIDE, _SIDE), np.float64)
 
 
 def is_compressed_near(grey: GreyArray, centre_px: FloatArray) -> bool:
@@ -111,12 +153,12 @@ def _step_of(size: FloatArray) -> float:
 class CompressedPixels:
     """Some pixels of a compressed photograph, and the intervals of their blocks' coefficients."""
 
-    # (k,): indices of the pixels in blocks that are complete and not clipped
+    # (k,): indices of the pixels in blocks that are complete and whose coefficients are known
     in_blocks: IndexArray
     places: IndexArray  # (k,): their indices in the flattened blocks
     # (n - k,): indices of the other pixels, which are compared one by one
     outside_blocks: IndexArray
-    observed: FloatArray  # (b, 8, 8): grey values of the blocks
+    observed: FloatArray  # (b, 8, 8): grey values of the blocks, before they were clipped
     # (b, 8, 8): limits of the coefficients before rounding
     low: FloatArray
     high: FloatArray
@@ -144,19 +186,27 @@ class CompressedPixels:
         block_values = grey[
             (_SIDE * rows)[:, None, None] + down, (_SIDE * columns)[:, None, None] + across
         ].astype(np.float64)
-        exact = (block_values.min(axis=(1, 2)) > 0.0) & (block_values.max(axis=(1, 2)) < _WHITE)
+        middle = np.rint(_transformed(block_values) / steps) * steps
+        decoded = _restored(middle)
+        low, high = block_values.min(axis=(1, 2)), block_values.max(axis=(1, 2))
+        # Where the decoder has clipped some pixels, coefficients are often the nearest multiples
+        # nevertheless. If they are, they decode to the same block.
+        is_clipped = (low <= 0.0) | (high >= _WHITE)
+        error = np.abs(np.clip(decoded, 0.0, _WHITE) - block_values).max(axis=(1, 2))
+        exact = ~is_clipped | (error < _MAX_DECODING_ERROR_COUNTS)
+        before_clipping = np.where(is_clipped[:, None, None], decoded, block_values)[exact]
+        middle = middle[exact]
         place = np.full(height * width // _SIDE**2, -1)
         place[which[exact]] = np.arange(np.count_nonzero(exact))
         block = np.full(len(x), -1)
         block[within] = place[number[within]]
         in_blocks = np.flatnonzero(block >= 0)
         flat = _SIDE**2 * block + _SIDE * (y % _SIDE) + x % _SIDE
-        middle = np.rint(_transformed(block_values[exact]) / steps) * steps
         return cls(
             in_blocks,
             flat[in_blocks],
             np.flatnonzero(block < 0),
-            block_values[exact],
+            before_clipping,
             middle - 0.5 * steps,
             middle + 0.5 * steps,
         )
