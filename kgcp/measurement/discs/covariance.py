@@ -29,7 +29,7 @@ from kgcp.measurement.image_model.residual_agreement import sums_over_arcs
 _ARC_PX = 6.0
 _FEWEST_ARCS = 8
 _ARCS_OF_PHOTOGRAPH = 40.0  # weight, in arcs, of the ratio of all discs against that of one disc
-_LEAST_SCATTER_LEFT = 1.0  # least scatter that a fit leaves
+_LEAST_EXPECTED = 1.0  # least scatter of a single disc with which its own is compared
 _OUTLYING_RATIO = 3.0  # times the median; larger ratios are those of single discs, and are cut
 _LEAST_FACTOR = 0.25  # of variances, as for coded targets
 # Variances by chance of a ratio of 1: from one arc or block, and from one pixel of an edge
@@ -76,9 +76,17 @@ class DiscScatter:
 
     independent: FloatArray  # (5, 5): of centroid [px] and moments [px²], for independent residuals
     common: FloatArray  # (5, 5): added for displacements of the whole edge, and the floor
-    ratio: float  # mean ratio of the scatter of scores to that of independent residuals
-    arcs: float  # number of arcs, or of blocks of equal weight, that it was found from
+    # Scatter of the scores over arcs, in units of the independent part, and the one that the fit
+    # leaves of independent residuals
+    scatter: float
+    expected: float
+    arcs: float  # number of arcs, or of blocks of equal weight, that these were found from
     is_noise_alone: bool  # whether nothing is clipped, and the light is linear
+
+    @property
+    def ratio(self) -> float:
+        """Ratio of the scatter to the expected one; small if a fit leaves hardly any."""
+        return self.scatter / max(self.expected, _LEAST_EXPECTED)
 
     def cov(self, inflation: float) -> FloatArray:
         """Return the covariance (5, 5) for an inflation of the independent part."""
@@ -105,7 +113,8 @@ def scatter_of(fit: DiscFit, compressed: CompressedFit | None = None) -> DiscSca
     of_own, of_all = np.ascontiguousarray((to_own @ scaled).T), np.ascontiguousarray(scaled.T)
     group = _arcs(fit) if compressed is None else compressed.block
     sums, products, count = sums_over_arcs(of_own, of_all, misfit.score, misfit.weight, group)
-    ratio, arcs = scatter_ratio(sums, products, to_own, inverse), float(count)
+    scatter, expected = scatter_over_arcs(sums, products, to_own, inverse)
+    arcs = float(count)
     # with an estimated noise, errors over deviations are distributed as Student's t
     freedom = fit.noise_freedom
     t_variance = freedom / (freedom - 2.0)
@@ -128,19 +137,19 @@ def scatter_of(fit: DiscFit, compressed: CompressedFit | None = None) -> DiscSca
     return DiscScatter(
         t_variance * (to_moments @ own[:, :GEOMETRY_COUNT] @ to_moments.T),
         to_moments @ common @ to_moments.T,
-        ratio,
+        scatter,
+        expected,
         arcs,
         not (fit.sample.is_burnt or fit.free.is_light_curved),
     )
 
 
-def scatter_ratio(
+def scatter_over_arcs(
     sums: FloatArray, products: FloatArray, to_own: FloatArray, inverse: FloatArray
-) -> float:
-    """Return the scatter of the arcs' scores relative to that of independent residuals.
+) -> tuple[float, float]:
+    """Return the scatter of the arcs' scores, and the expected one of independent residuals.
 
-    On an arc whose normal matrix is A, a fit leaves A − A N⁻¹ A of the scatter of independent
-    residuals.
+    Of the latter, a fit leaves A − A N⁻¹ A on an arc whose normal matrix is A.
 
     Parameters
     ----------
@@ -153,8 +162,8 @@ def scatter_ratio(
     inverse : (p, p) array
         N⁻¹, of all arcs and the priors.
     """
-    scatter_left = np.sum(products.sum(axis=0) * to_own) - np.sum((products @ inverse) * products)
-    return float(np.sum(sums * sums)) / max(float(scatter_left), _LEAST_SCATTER_LEFT)
+    expected = np.sum(products.sum(axis=0) * to_own) - np.sum((products @ inverse) * products)
+    return float(np.sum(sums * sums)), float(expected)
 
 
 def inflations(scatters: Sequence[DiscScatter]) -> FloatArray:
@@ -165,19 +174,17 @@ def inflations(scatters: Sequence[DiscScatter]) -> FloatArray:
     arcs, and the photograph's like forty arcs. What exceeds 1 by chance is taken off: a single disc
     has only eight arcs or a few more.
 
-    A factor is below 1 if the whole photograph shows that, beyond chance. Compression and a
-    camera's denoising leave residuals that cancel each other over neighbouring pixels. With JPEG of
-    quality 92, the squared scatter over blocks is 0.5 to 0.75 of that of independent residuals, and
-    squared errors are smaller by the same factor. This does not hold for burnt discs, whose levels
-    are known beforehand rather than from residuals, nor for discs at the edge of a shadow, whose
-    residuals are not only noise.
+    A factor is below 1 if the whole photograph shows that, beyond chance: a camera's denoising
+    leaves residuals that cancel each other over neighbouring pixels. This does not hold for burnt
+    discs, whose levels are known beforehand rather than from residuals, nor at edges of shadows,
+    where residuals are not only noise.
     """
     if not scatters:
         return np.empty(0)
     is_noise_alone = np.array([each.is_noise_alone for each in scatters])
     ratios = np.array([each.ratio for each in scatters])
     arcs = np.array([each.arcs for each in scatters], dtype=np.float64)
-    of_photograph = _typical(ratios)
+    of_photograph = _ratio_of_photograph(scatters)
     chance = np.array(_ARC_VARIANCE / arcs.sum())
     shown = max(1.0 - float(beyond_chance(np.array(1.0 - of_photograph), chance)), _LEAST_FACTOR)
     least = np.where(is_noise_alone, shown, 1.0)
@@ -187,9 +194,17 @@ def inflations(scatters: Sequence[DiscScatter]) -> FloatArray:
     return least + beyond_chance(pooled - least, _ARC_VARIANCE * (arcs + shared) / weight**2)
 
 
-def _typical(ratios: FloatArray) -> float:
-    """Return the mean of ratios (n,), with those of single discs that are far above it cut."""
-    return float(np.mean(np.minimum(ratios, _OUTLYING_RATIO * np.median(ratios))))
+def _ratio_of_photograph(scatters: Sequence[DiscScatter]) -> float:
+    """Return the scatter of all discs relative to the expected one.
+
+    Of small discs in JPEGs, which fill two blocks each, a fit leaves hardly any scatter; together
+    they tell it nevertheless. Ratios of single discs that are far above the others are cut.
+    """
+    ratios = np.array([each.ratio for each in scatters])
+    usual = np.minimum(ratios, _OUTLYING_RATIO * np.median(ratios))
+    expected = np.array([each.expected for each in scatters])
+    scatter = float(np.sum(usual * np.maximum(expected, _LEAST_EXPECTED)))
+    return scatter / max(float(expected.sum()), _LEAST_EXPECTED)
 
 
 def beyond_chance(excess: FloatArray, variance: FloatArray) -> FloatArray:

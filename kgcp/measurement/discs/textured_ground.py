@@ -28,7 +28,7 @@ from kgcp.measurement.discs.covariance import (
     DiscScatter,
     inflations,
     moments_by_stretch,
-    scatter_ratio,
+    scatter_over_arcs,
 )
 from kgcp.measurement.discs.disc_levels import COUNT, GEOMETRY_COUNT, Row
 from kgcp.measurement.discs.fit_disc import (
@@ -228,12 +228,12 @@ def _scatter(
     inverse: FloatArray = np.linalg.inv(normal).astype(np.float64)
     own = inverse[:GEOMETRY_COUNT]
     to_own = np.linalg.solve(np.linalg.cholesky(own[:, :GEOMETRY_COUNT]), own)
-    ratio = scatter_ratio(
+    scatter, expected = scatter_over_arcs(
         of_arcs[:, :, -1] @ to_own.T, to_own @ of_arcs[:, :, :-1], to_own, inverse
     )
     to_moments = moments_by_stretch(state.geometry)
     independent = to_moments @ own[:, :GEOMETRY_COUNT] @ to_moments.T
-    textured = replace(plain, independent=independent, ratio=ratio)
+    textured = replace(plain, independent=independent, scatter=scatter, expected=expected)
     if mean_radius_px(state.geometry) <= _ONE_GROUND_PX:
         return textured
     least, stated = (float(inflations([each])[0]) * each.independent for each in (plain, textured))

@@ -73,7 +73,7 @@ def test_centres_are_more_accurate_than_those_from_grey_values_and_so_stated() -
         z.append(before[-1] ** 2 / stated_of(made))
     ratio = np.sqrt(np.mean(np.square(before)) / np.mean(np.square(rounded)))
     assert 0.75 < ratio < 0.95
-    assert 0.88 < np.sqrt(np.mean(z)) < 1.12
+    assert 0.85 < np.sqrt(np.mean(z)) < 1.2
 
 
 def test_intervals_of_fine_steps_tell_what_grey_values_tell() -> None:

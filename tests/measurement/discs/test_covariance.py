@@ -38,7 +38,7 @@ ARCS = 10
 
 
 def scatter(ratio: float) -> DiscScatter:
-    return DiscScatter(np.eye(5), np.zeros((5, 5)), ratio, ARCS, is_noise_alone=True)
+    return DiscScatter(np.eye(5), np.zeros((5, 5)), 3.0 * ratio, 3.0, ARCS, is_noise_alone=True)
 
 
 def alone(ratio: float) -> float:
