@@ -133,6 +133,8 @@ class BiasStudy:
     frames_without_pose: tuple[str, ...]  # frames without a reference pose
     # frames with a reference distance far less certain than in most, for example without GNSS
     frames_with_vague_reference: tuple[str, ...]
+    # frames with several plates of one code, which do not tell which of them is the target
+    frames_with_several_plates: tuple[str, ...]
     absences: tuple[NoPosition, ...]  # why the target's position is unknown in some frames
 
     def trusts(self, pair: Comparison) -> bool:
@@ -161,7 +163,8 @@ def study_bias(
     Parameters
     ----------
     attempts : sequence of Attempt
-        One per frame and target. Targets that were never measured are left out.
+        Targets that were never measured are left out, and so are those of which a frame shows
+        several plates with the same code.
     motions : CameraMotions, optional
         Motion of the camera while a rolling shutter reads the frames, in the order of the poses.
         The poses are those of the middle row. None: the camera does not move, or all rows are
@@ -173,7 +176,11 @@ def study_bias(
         If nothing was measured, if no measured frame has a pose, or as
         `TargetPositions.positions`.
     """
-    considered = _with_measured_target(attempts)
+    several = {(each.frame, each.target) for each in attempts if _is_second_plate(each)}
+    considered = _with_measured_target(
+        [attempt for attempt in attempts if (attempt.frame, attempt.target) not in several],
+        len(several),
+    )
     has_pose = set(poses.frames)
     posed = [attempt for attempt in considered if attempt.frame in has_pose]
     if not any(attempt.sighting for attempt in posed):
@@ -202,6 +209,7 @@ def study_bias(
         attitudes_agree=agree,
         frames_without_pose=tuple(sorted({each.frame for each in considered} - has_pose)),
         frames_with_vague_reference=vague,
+        frames_with_several_plates=tuple(sorted({frame for frame, _ in several})),
         absences=tuple(position for position in positions if isinstance(position, NoPosition)),
     )
 
@@ -271,19 +279,23 @@ def _without_vague(pairs: Sequence[Comparison]) -> tuple[list[Comparison], tuple
     return kept, tuple(sorted(vague))
 
 
-def _with_measured_target(attempts: Sequence[Attempt]) -> list[Attempt]:
+def _is_second_plate(attempt: Attempt) -> bool:
+    return attempt.sighting is not None and attempt.sighting.instance > 0
+
+
+def _with_measured_target(attempts: Sequence[Attempt], several: int) -> list[Attempt]:
     measured = {attempt.target for attempt in attempts if attempt.sighting is not None}
+    if not measured and several:
+        raise KgcpError(
+            f"all {several} measurements are in frames with several plates of the same code, which"
+            " do not tell which of them is the target; cover the others, or leave them at home"
+        )
     if not measured:
         raise KgcpError(
             f"no target was measured in {len(attempts)} attempts, so that there is nothing to"
             " compare; see the reasons that 'kgcp detect' prints"
         )
-    return [
-        attempt
-        for attempt in attempts
-        if attempt.target in measured
-        and (attempt.sighting is None or not attempt.sighting.instance)
-    ]
+    return [attempt for attempt in attempts if attempt.target in measured]
 
 
 def _no_pose(attempts: Sequence[Attempt], poses: ReferencePoses) -> str:

@@ -16,6 +16,7 @@ from kgcp.georef.target_positions import NoPosition, TargetPositions
 from kgcp.georef.trajectory import Trajectory
 from kgcp.measurement.plate_prior import SceneRotation
 from kgcp.quality.bias_study import edge_distances, study_bias
+from kgcp.report.bias.numbers import bias_numbers
 from kgcp.settings import Method, VehicleSettings
 from kgcp.targets.layout import Ring, Target
 
@@ -178,15 +179,19 @@ def test_a_reference_far_less_certain_than_the_others_is_not_compared() -> None:
     assert len(study.measured) == 4
 
 
-def test_second_plates_are_not_compared() -> None:
+def test_frames_with_two_plates_of_one_code_are_not_compared() -> None:
+    """The better score may be that of another vehicle's plate."""
     attempts = _attempts()
     sighting = attempts[0].sighting
     assert sighting is not None
     second = replace(attempts[0], sighting=replace(sighting, instance=1, distance_m=99.0))
-    study = study_bias(
-        [*attempts, second], _nadir_poses(_ABOVE), _TARGET_POSITIONS, _CAMERA, [_TARGET], _METHOD
-    )
-    assert len(study.measured) == 4
+    poses = _nadir_poses(_ABOVE)
+    study = study_bias([*attempts, second], poses, _TARGET_POSITIONS, _CAMERA, [_TARGET], _METHOD)
+    assert [pair.attempt.frame for pair in study.measured] == [_frame(1), _frame(2), _frame(3)]
+    assert study.frames_with_several_plates == (_frame(0),)
+    assert dict(bias_numbers(study).left_out)["second_plate"] == 1
+    with pytest.raises(KgcpError, match="all 1 measurements are in frames with several plates"):
+        study_bias([attempts[0], second], poses, _TARGET_POSITIONS, _CAMERA, [_TARGET], _METHOD)
 
 
 def test_nothing_to_compare_is_an_error_with_a_remedy() -> None:

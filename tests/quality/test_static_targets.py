@@ -148,6 +148,14 @@ def test_another_target_in_a_single_frame_is_reported_with_the_frame() -> None:
     assert "D in f_005.png" in doubt.sentence
 
 
+def test_frames_with_two_plates_of_one_code_raise_no_doubt() -> None:
+    flight, beside_m = GroundFlight(), np.array([2.0, 1.0, 0.0])
+    spares = seen(flight, lambda _, name, pose: (name, shifted(pose, beside_m)))
+    best = [each for each in spares if each.target == "D"]
+    second = [replace(each, instance=1) if each.target == "D" else each for each in seen(flight)]
+    assert check([*best, *second], stated(flight)) == ()
+
+
 def test_two_targets_contradict_each_other() -> None:
     flight = GroundFlight(names=("A", "B"), offsets_m=GroundFlight().offsets_m[:2])
     assert check(seen(flight), stated(flight)) == ()

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -21,7 +22,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import rotation_about
-from kgcp.georef.sighting import Sighting
+from kgcp.georef.sighting import Sighting, unmistakable
 from kgcp.georef.target_positions import TargetPosition
 from kgcp.measurement.plate_prior import SceneRotation
 from kgcp.network.ground.point_images import CameraPose, PointImages, Readout
@@ -142,7 +143,7 @@ def orient_frames(
     frames : sequence of str
         Frames to orient.
     sightings : sequence of Sighting
-        Sightings of static targets; second plates with the same code are ignored.
+        Sightings of static targets; those in frames with several plates of a code are left out.
     positions : mapping of str to TargetPosition
         Positions of the static targets in the ENU frame.
     min_points : int
@@ -157,15 +158,17 @@ def orient_frames(
         Known rotations of the scene during the readout, by frame.
     """
     by_frame: dict[str, list[Sighting]] = {frame: [] for frame in frames}
-    for each in sightings:
-        if each.frame in by_frame and each.target in positions and not each.instance:
-            by_frame[each.frame].append(each)
+    static = [each for each in sightings if each.frame in by_frame and each.target in positions]
+    for each in unmistakable(static):
+        by_frame[each.frame].append(each)
+    several = Counter(frame for frame, _ in {(e.frame, e.target) for e in static if e.instance})
     poses = []
     for frame, in_frame in by_frame.items():
         usable = [each for each in in_frame if each.centre_cov_px2 is not None]
         names = tuple(each.target for each in usable)
         if len(usable) < 3:
-            poses.append(FramePose(frame, names, None, None, (), _count_words(len(usable))))
+            reason = _count_words(len(usable), several[frame])
+            poses.append(FramePose(frame, names, None, None, (), reason))
             continue
         images = point_images(usable, positions, sd_scale, camera, rotations.get(frame))
         poses.append(
@@ -328,8 +331,10 @@ def _of_resection(
     )
 
 
-def _count_words(count: int) -> str:
-    return "no static target" if count == 0 else f"{count} static target{'s' * (count > 1)}"
+def _count_words(count: int, several: int) -> str:
+    words = "no static target" if count == 0 else f"{count} static target{'s' * (count > 1)}"
+    besides = f", besides {several} whose code several plates have"
+    return words + besides * (several > 0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,7 +23,7 @@ from kgcp.geometry.pose import Pose
 from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.scene_rotation import CameraMotions
-from kgcp.georef.sighting import Sighting
+from kgcp.georef.sighting import Sighting, unmistakable
 from kgcp.georef.target_positions import static_position
 from kgcp.network.ground.circles_together import MovedCircleError, place_circles
 from kgcp.network.ground.moved_circle import Split
@@ -216,7 +216,7 @@ def place_targets(
     Parameters
     ----------
     sightings : sequence of Sighting
-        In the frames' order; second plates with the same code are ignored.
+        In the frames' order; those in frames with several plates of a code are left out.
     targets : sequence of Target or PlainTarget
         Static targets.
     poses : ReferencePoses
@@ -234,10 +234,12 @@ def place_targets(
     skipped: dict[str, str] = {}
     usable, all_views, all_frames = [], [], []
     for target in targets:
-        of_target = [each for each in sightings if each.target == target.name and not each.instance]
+        named = [each for each in sightings if each.target == target.name]
+        of_target = unmistakable(named)
         posed = [each for each in of_target if each.frame in rows and _has_pose(each)]
         if len(posed) < min_frames:
-            skipped[target.name] = _too_few(of_target, posed, rows, min_frames)
+            several = sum(not each.instance for each in named) - len(of_target)
+            skipped[target.name] = _too_few(of_target, posed, rows, min_frames, several)
             continue
         at = [rows[each.frame] for each in posed]
         moments, cov = _images(camera, posed, 0.5 * target.outer_diameter_m)
@@ -327,14 +329,16 @@ def _too_few(
     posed: Sequence[Sighting],
     rows: Mapping[str, int],
     min_frames: int,
+    several: int,
 ) -> str:
+    besides = f", besides {several} that show several plates with its code" * (several > 0)
     if not of_target:
-        return "measured in no frame"
+        return f"measured in no frame{besides}"
     oriented = sum(each.frame in rows for each in of_target)
     if oriented > len(posed):
         return f"{oriented - len(posed)} of its measurements have no covariance"
     return (
-        f"measured in {len(of_target)} frames, {len(posed)} of them with a reference pose;"
+        f"measured in {len(of_target)} frames{besides}, {len(posed)} of them with a reference pose;"
         f" {min_frames} are needed"
     )
 

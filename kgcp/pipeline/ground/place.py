@@ -232,9 +232,7 @@ def _used_sightings(placement: Placement, sightings: Sequence[Sighting]) -> tupl
         for frame, is_used in zip(placed.frames, placed.is_used, strict=True)
         if is_used
     }
-    return tuple(
-        each for each in sightings if (each.target, each.frame) in used and not each.instance
-    )
+    return tuple(each for each in sightings if (each.target, each.frame) in used)
 
 
 def write_places(

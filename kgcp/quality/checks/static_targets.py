@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 
 from kgcp.geometry.camera import Camera
-from kgcp.georef.sighting import Sighting
+from kgcp.georef.sighting import Sighting, unmistakable
 from kgcp.georef.target_positions import TargetPosition
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
 from kgcp.quality.number_text import rounded
@@ -84,8 +84,8 @@ def _pairs(
 ) -> list[_Pair]:
     """Return the distances between all pairs of static targets, frame by frame."""
     by_frame: dict[str, dict[str, Sighting]] = defaultdict(dict)
-    for each in sightings:
-        if each.target in positions and not each.instance and each.pose is not None:
+    for each in unmistakable(sightings):
+        if each.target in positions and each.pose is not None:
             by_frame[each.frame][each.target] = each
     return [
         pair

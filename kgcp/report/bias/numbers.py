@@ -192,6 +192,8 @@ def bias_numbers(study: BiasStudy) -> BiasNumbers:
         left_out["no_reference_pose"] = len(study.frames_without_pose)
     if study.frames_with_vague_reference:
         left_out["vague_reference"] = len(study.frames_with_vague_reference)
+    if study.frames_with_several_plates:
+        left_out["second_plate"] = len(study.frames_with_several_plates)
     return BiasNumbers(
         compared=tuple(compared),
         data=data,

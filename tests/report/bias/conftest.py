@@ -60,6 +60,6 @@ def study() -> Study:
         *compared: Comparison, attitudes_agree: bool = True, method: Method = Method.MODEL
     ) -> BiasStudy:
         measured = tuple(pair for pair in compared if pair.attempt.sighting is not None)
-        return BiasStudy(method, measured, compared, attitudes_agree, ("lost.jpg",), (), ())
+        return BiasStudy(method, measured, compared, attitudes_agree, ("lost.jpg",), (), (), ())
 
     return made
