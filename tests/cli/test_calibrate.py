@@ -377,6 +377,19 @@ def test_two_focal_lengths_are_two_cameras(photos: Path, tmp_path: Path) -> None
     assert result.stderr.count("\n") == 1
 
 
+def test_a_missing_focal_length_is_no_other_camera(photos: Path, tmp_path: Path) -> None:
+    for index, focal in ((1, 24.0), (2, None)):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "Maker", "M1"
+        if focal is not None:
+            exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLength] = focal
+        with Image.open(photos / f"photo{index}.png") as image:
+            image.save(tmp_path / f"{index}.jpg", quality=98, exif=exif)
+    field, out = photos / "field.toml", tmp_path / "out"
+    result = run(tmp_path, "--field", field, "--out", out, *QUIET)
+    assert "2 of 2 photographs can be used, and 3 are needed" in result.stderr
+
+
 def test_a_field_in_one_row_is_not_enough(photos: Path, tmp_path: Path) -> None:
     """All but one row is out of the frame."""
     folder = tmp_path / "photos"

@@ -339,6 +339,8 @@ def _of_one_camera(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[PhotoDiscs
     """
     found = [result for result in results if isinstance(result, PhotoDiscs)]
     lenses = Counter(result.lens for result in found if result.lens)
+    for camera in {_without_focal(lens) for lens in lenses if lens != _without_focal(lens)}:
+        del lenses[camera]  # photographs without a focal length in their EXIF may have any
     if len(lenses) > 1:
         (first, first_count), (second, second_count) = lenses.most_common(2)
         raise KgcpError(
@@ -363,6 +365,10 @@ def _of_one_camera(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[PhotoDiscs
         )
         for result in results
     ]
+
+
+def _without_focal(lens: str) -> str:
+    return lens.removesuffix(" mm").rpartition(" ")[0] if lens.endswith(" mm") else lens
 
 
 def _without_duplicates(
