@@ -49,7 +49,9 @@ class _Chosen:
     state: AdjustedNetwork
     fixed: AdjustedNetwork  # the same with the field as stated
     points: PointModel
-    is_turn_unclear: bool  # as in `CameraCalibration`
+    # If it is not clear how a symmetric field lies in some photographs: the adjustment of its shape
+    # with the discs renamed. The above are then for the field as stated.
+    unclear: tuple[CalibrationProblem, AdjustedNetwork] | None = None
 
 
 def missing_discs(calibration: CameraCalibration) -> dict[str, tuple[IndexArray, FloatArray]]:
@@ -144,10 +146,15 @@ def _calibrated(problem: CalibrationProblem, start: CameraCalibration | None) ->
     dropped = (*disordered, *(() if start is None else start.dropped), *misfits)
     _require_views(problem.views)
     chosen = _chosen(problem, state)
-    apart = photographs_apart(chosen.problem, chosen.state)
+    # errors of the field as stated would hide that a photograph stands apart
+    apart = photographs_apart(*(chosen.unclear or (chosen.problem, chosen.state)))
     if apart:
         is_apart = np.array([view.photo in apart for view in problem.views])
-        chosen = _chosen(*without(problem, state, is_apart))
+        others = _chosen(*without(problem, state, is_apart))
+        if chosen.unclear and others.unclear:
+            apart = ()
+        else:
+            chosen = others
     return _result(_with_bends(chosen), tuple(dict.fromkeys((*dropped, *apart))))
 
 
@@ -156,16 +163,15 @@ def _chosen(problem: CalibrationProblem, state: AdjustedNetwork) -> _Chosen:
     fixed = with_chosen_parameters(problem, state)
     points = problem.settings.points
     if points is PointModel.FIXED:
-        return _Chosen(problem, fixed, fixed, points, is_turn_unclear=False)
+        return _Chosen(problem, fixed, fixed, points)
     # k1 and k2 alone until the field has its true shape: more terms would absorb its errors
     state = problem.adjusted(state.camera, state.estimate, replace(state.unknowns, points=points))
-    is_turn_unclear = False
     if any(view.is_symmetric for view in problem.views):
-        problem, state, is_turn_unclear = with_turns(problem, state)
-    if is_turn_unclear:
-        return _Chosen(problem, fixed, fixed, PointModel.FIXED, is_turn_unclear=True)
-    state = with_chosen_parameters(problem, state)
-    return _Chosen(problem, state, fixed, points, is_turn_unclear=False)
+        turned, state, is_unclear = with_turns(problem, state)
+        if is_unclear:
+            return _Chosen(problem, fixed, fixed, PointModel.FIXED, (turned, state))
+        problem = turned
+    return _Chosen(problem, with_chosen_parameters(problem, state), fixed, points)
 
 
 def _with_bends(chosen: _Chosen) -> _Chosen:
@@ -262,7 +268,7 @@ def _result(chosen: _Chosen, dropped: tuple[str, ...]) -> CameraCalibration:
         problem.radius_scales(state),
         tuple(names[weak].tolist()),
         tangled(model.names, _with_focal_difference(model.names, cov), _MAX_INFLATION),
-        chosen.is_turn_unclear,
+        chosen.unclear is not None,
     )
 
 
