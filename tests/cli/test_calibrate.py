@@ -528,6 +528,14 @@ def test_a_place_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     assert "none: is neither an image nor a folder; name one of them" in result.stderr
 
 
+def test_files_of_a_phone_are_to_be_converted(tmp_path: Path) -> None:
+    photo = tmp_path / "1.HEIC"
+    photo.write_bytes(b"")
+    result = run(photo, "--field", "grid:5x4:30mm:16mm", *QUIET)
+    assert result.exit_code == 1
+    assert "1.HEIC: kgcp does not read such files of a phone; convert them to" in result.stderr
+
+
 def test_the_choices_are_those_of_the_library() -> None:
     assert list(PointModel) == list(POINT_MODELS)
     assert list(LensModel) == list(LENSES)

@@ -128,7 +128,7 @@ def frames_among(names: Sequence[str], folder: str, remedy: str = CORRECT_FOLDER
     if not counts:
         raise KgcpError(f"{folder}: holds no images; put them there or {remedy}")
     suffix, count = counts.most_common(1)[0]
-    kind, conversion = _kind_of(suffix)
+    kind, conversion = kind_of(suffix)
     if kind == "files":
         conversion += f", or {remedy}"
     raise KgcpError(
@@ -174,7 +174,7 @@ def is_chosen(frame: str, patterns: Sequence[str]) -> bool:
     )
 
 
-def _kind_of(suffix: str) -> tuple[str, str]:
+def kind_of(suffix: str) -> tuple[str, str]:
     """Return the kind of files with a suffix that is no image's, and how to convert them."""
     if suffix in _RAW_SUFFIXES:
         return "raw files", (

@@ -17,7 +17,7 @@ import numpy as np
 from kgcp.errors import KgcpError, KgcpWarning, Reason
 from kgcp.geometry.camera import Response
 from kgcp.io.files.safe_read import is_file, is_folder
-from kgcp.io.images.frames import FRAME_SUFFIXES, list_frames
+from kgcp.io.images.frames import FRAME_SUFFIXES, kind_of, list_frames
 from kgcp.io.images.remote import stamps_of
 from kgcp.io.tables.provenance import versions
 from kgcp.measurement.discs.camera_tone import CameraTone
@@ -147,6 +147,9 @@ def find_photos(places: Sequence[Path]) -> list[Photo]:
             photos += [Photo(f"{prefix}{name}", place / name) for name in names]
         elif is_file(place) and place.suffix.lower() in FRAME_SUFFIXES:
             photos.append(Photo(place.name, place))
+        elif is_file(place):
+            kind, conversion = kind_of(place.suffix.lower())
+            raise KgcpError(f"{place}: kgcp does not read such {kind}; {conversion}")
         else:
             raise KgcpError(f"{place}: is neither an image nor a folder; name one of them")
     counts = Counter(photo.name for photo in photos)
