@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -190,7 +191,8 @@ def _before_compression(
 ) -> list[tuple[DiscFit, DiscScatter] | DiscMiss]:
     """Return the outcomes, with discs adjusted to the intervals of rounded coefficients.
 
-    Burnt discs stay as they are: blocks with clipped pixels have no exact coefficients.
+    Burnt discs stay as they are: most of their blocks have no certain coefficients. So do discs
+    that the coefficients do not determine.
     """
     measured = {
         index: each[0]
@@ -203,7 +205,8 @@ def _before_compression(
     refined = adjust_to_intervals(list(measured.values()), steps)
     for index, compressed in zip(measured, refined, strict=True):
         if compressed is not None:
-            adjusted[index] = (compressed.fit, scatter_of(compressed.fit, compressed))
+            with suppress(np.linalg.LinAlgError):
+                adjusted[index] = (compressed.fit, scatter_of(compressed.fit, compressed))
     return adjusted
 
 
