@@ -161,7 +161,9 @@ def orient_frames(
     static = [each for each in sightings if each.frame in by_frame and each.target in positions]
     for each in unmistakable(static):
         by_frame[each.frame].append(each)
-    several = Counter(frame for frame, _ in {(e.frame, e.target) for e in static if e.instance})
+    several = Counter(
+        frame for frame, _ in {(each.frame, each.target) for each in static if each.instance}
+    )
     poses = []
     for frame, in_frame in by_frame.items():
         usable = [each for each in in_frame if each.centre_cov_px2 is not None]

@@ -5,16 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from kgcp.geometry.arrays import FloatArray, GreyArray
-from kgcp.geometry.camera import Camera
+from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.circle_image import circle_images
 from kgcp.geometry.pose import Pose
+from kgcp.measurement.discs import measure
 from kgcp.measurement.discs.adjust_disc import DiscTask, adjust_disc
 from kgcp.measurement.discs.compressed_fit import CompressedFit, adjust_to_intervals
 from kgcp.measurement.discs.covariance import DiscScatter, inflations, scatter_of
 from kgcp.measurement.discs.fit_disc import DiscFit, DiscUnknowns
+from kgcp.measurement.discs.measure import measure_discs
 from kgcp.measurement.discs.outlines import find_outlines
+from kgcp.measurement.discs.records import Disc
 from kgcp.measurement.image_model.compression import quantisation_steps
 from kgcp.measurement.image_model.photometry import Tone
 from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, field_circles, photograph
@@ -99,3 +103,24 @@ def test_without_whole_blocks_the_fit_to_grey_values_stays() -> None:
     steps = np.full((8, 8), 4.0)
     assert adjust_to_intervals([without], steps) == [None]
     assert adjust_to_intervals([fit], steps) != [None]
+
+
+def test_discs_that_coefficients_do_not_determine_keep_the_fit_to_grey_values(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def singular(fit: DiscFit, compressed: CompressedFit | None = None) -> DiscScatter:
+        if compressed is not None:
+            raise np.linalg.LinAlgError
+        return scatter_of(fit)
+
+    photo = compressed(bright_discs(4)[0], 85)
+    outlines = find_outlines(photo)[:12]
+    monkeypatch.setattr(measure, "scatter_of", singular)
+    kept = measure_discs(photo, outlines, response=Response.LINEAR)
+    monkeypatch.setattr(measure, "quantisation_steps", lambda _: None)
+    by_grey_values = measure_discs(photo, outlines, response=Response.LINEAR)
+    for one, other in zip(kept, by_grey_values, strict=True):
+        assert isinstance(one, Disc)
+        assert isinstance(other, Disc)
+        assert np.array_equal(one.vector, other.vector)
+        assert np.array_equal(one.cov, other.cov)
