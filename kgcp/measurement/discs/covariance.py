@@ -93,34 +93,34 @@ class DiscScatter:
         return inflation * self.independent + self.common
 
 
-def scatter_of(fit: DiscFit, compressed: CompressedFit | None = None) -> DiscScatter:
+def scatter_of(adjusted: DiscFit | CompressedFit) -> DiscScatter:
     """Return the parts of the covariance of centroid and second moments.
 
-    Parameters
-    ----------
-    fit : DiscFit
-        One that `check_disc_fit` accepts, with enough redundancy.
-    compressed : CompressedFit, optional
-        The equations of a fit to intervals, whose state `fit` has.
+    The fit must be one that `check_disc_fit` accepts, with enough redundancy.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the equations are singular.
     """
-    misfit, scaled, normal = fit.misfit, fit.scaled, fit.normal
-    if compressed is not None:
-        misfit, scaled, normal = compressed.misfit, compressed.scaled, compressed.normal
-    inverse = np.linalg.inv(normal).astype(np.float64)
+    fit = adjusted.fit if isinstance(adjusted, CompressedFit) else adjusted
+    misfit, scaled = adjusted.misfit, adjusted.scaled
+    inverse = np.linalg.inv(adjusted.normal).astype(np.float64)
     own = inverse[:GEOMETRY_COUNT]
     root = np.linalg.cholesky(own[:, :GEOMETRY_COUNT])
     to_own = np.linalg.solve(root, own)  # in units of N⁻¹
     of_own, of_all = np.ascontiguousarray((to_own @ scaled).T), np.ascontiguousarray(scaled.T)
-    group = _arcs(fit) if compressed is None else compressed.block
+    group = adjusted.block if isinstance(adjusted, CompressedFit) else _arcs(fit)
     sums, products, count = sums_over_arcs(of_own, of_all, misfit.score, misfit.weight, group)
     scatter, expected = scatter_over_arcs(sums, products, to_own, inverse)
-    arcs = float(count)
-    # with an estimated noise, errors over deviations are distributed as Student's t
-    freedom = fit.noise_freedom
-    t_variance = freedom / (freedom - 2.0)
-    if compressed is not None:  # the noise is that of all discs, and blocks differ in weight
-        shares, t_variance = np.einsum("bkp,kp->b", products, to_own), 1.0
-        arcs = float(shares.sum() ** 2 / np.sum(shares * shares))
+    if isinstance(adjusted, CompressedFit):
+        # blocks differ in weight, and the noise is known from all discs of the photograph
+        shares = np.einsum("bkp,kp->b", products, to_own)
+        arcs, t_variance = float(shares.sum() ** 2 / np.sum(shares * shares)), 1.0
+    else:
+        # with an estimated noise, errors over deviations are distributed as Student's t
+        freedom = fit.noise_freedom
+        arcs, t_variance = float(count), freedom / (freedom - 2.0)
     if _edges_tell_displacement(fit):  # `RingUnknowns` allows for the displacement itself
         common_px = max(_FLOOR_PX, _SHARE_LEFT_OF_RING * _camera_displacement_px(fit))
     else:

@@ -159,7 +159,7 @@ def _measured(
     camera = learn_tone([tasks], response) if camera is None else camera
     outcomes = [_fitted(task, camera) for task in tasks]
     if steps is not None:
-        outcomes = _before_compression(outcomes, steps)
+        outcomes = _adjusted_to_intervals(outcomes, steps)
     fits = [each for each in outcomes if not isinstance(each, DiscMiss)]
     factors = iter(inflations([scatter for _, scatter in fits]).tolist())
     return [
@@ -186,7 +186,7 @@ def _fitted(task: DiscTask, camera: CameraTone) -> tuple[DiscFit, DiscScatter] |
         return DiscMiss(task.outline, DiscReason.POOR_FIT, "singular equations")
 
 
-def _before_compression(
+def _adjusted_to_intervals(
     outcomes: list[tuple[DiscFit, DiscScatter] | DiscMiss], steps: FloatArray
 ) -> list[tuple[DiscFit, DiscScatter] | DiscMiss]:
     """Return the outcomes, with discs adjusted to the intervals of rounded coefficients.
@@ -206,7 +206,7 @@ def _before_compression(
     for index, compressed in zip(measured, refined, strict=True):
         if compressed is not None:
             with suppress(np.linalg.LinAlgError):
-                adjusted[index] = (compressed.fit, scatter_of(compressed.fit, compressed))
+                adjusted[index] = (compressed.fit, scatter_of(compressed))
     return adjusted
 
 

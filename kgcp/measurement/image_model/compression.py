@@ -97,7 +97,7 @@ def quantisation_steps(grey: GreyArray) -> FloatArray | None:
     is_determinable = np.count_nonzero(size > _MAX_ZERO, axis=0) >= _MIN_COEFFICIENTS
     if np.count_nonzero(is_determined) < _MIN_DETERMINED_SHARE * np.count_nonzero(is_determinable):
         return None
-    usual = _usual_steps(steps[is_determined], is_determined)
+    usual = _usual_steps(steps)
     if usual is not None:
         return usual
     known = np.where(is_determined, steps, 1.0).reshape(_SIDE, _SIDE)
@@ -105,20 +105,16 @@ def quantisation_steps(grey: GreyArray) -> FloatArray | None:
     return np.where(is_determined.reshape(_SIDE, _SIDE), known, lower)
 
 
-def _usual_steps(determined: FloatArray, is_determined: BoolArray) -> FloatArray | None:
-    """Return the steps (8, 8) of the quality whose table agrees with some; None: none does.
+def _usual_steps(steps: FloatArray) -> FloatArray | None:
+    """Return the table (8, 8) of the quality that agrees with steps (64,); None: none does.
 
-    Parameters
-    ----------
-    determined : (k,) array
-        The steps that are determined.
-    is_determined : (64,) array
-        Which steps these are.
+    Steps that are not determined are NaN.
     """
     qualities = np.arange(1, 101)
     percent = np.where(qualities < 50, 5000 // qualities, 200 - 2 * qualities)
     tables = np.clip((np.outer(percent, _PROPOSED_STEPS) + 50) // 100, 1, 255)
-    agreeing = np.mean(tables[:, is_determined] == determined, axis=1)
+    is_determined = np.isfinite(steps)
+    agreeing = np.mean(tables[:, is_determined] == steps[is_determined], axis=1)
     best = int(np.argmax(agreeing))
     if agreeing[best] < _MIN_AGREEING_SHARE:
         return None

@@ -59,7 +59,7 @@ def stated(scatters: list[DiscScatter]) -> FloatArray:
 
 
 def stated_of(made: list[CompressedFit]) -> FloatArray:
-    return stated([scatter_of(each.fit, each) for each in made])
+    return stated([scatter_of(each) for each in made])
 
 
 def test_centres_are_more_accurate_than_those_from_grey_values_and_so_stated() -> None:
@@ -108,10 +108,10 @@ def test_without_whole_blocks_the_fit_to_grey_values_stays() -> None:
 def test_discs_that_coefficients_do_not_determine_keep_the_fit_to_grey_values(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def singular(fit: DiscFit, compressed: CompressedFit | None = None) -> DiscScatter:
-        if compressed is not None:
+    def singular(adjusted: DiscFit | CompressedFit) -> DiscScatter:
+        if isinstance(adjusted, CompressedFit):
             raise np.linalg.LinAlgError
-        return scatter_of(fit)
+        return scatter_of(adjusted)
 
     photo = compressed(bright_discs(4)[0], 85)
     outlines = find_outlines(photo)[:12]
