@@ -68,6 +68,14 @@ def test_an_excess_common_to_all_discs_of_a_photograph_counts_in_full() -> None:
     assert inflations([]).shape == (0,)
 
 
+def test_ratios_of_few_blocks_count_in_full_though_they_scatter() -> None:
+    blocks = 2.0  # of a small disc in a JPEG
+    rng = np.random.default_rng(6)
+    ratios = 2.0 * rng.chisquare(blocks, 2000) / blocks
+    scatters = [replace(scatter(each), arcs=blocks) for each in ratios]
+    assert 1.85 < np.mean(inflations(scatters)) < 2.1
+
+
 def test_ratios_below_one_count_if_the_whole_photograph_shows_them() -> None:
     ratios = 0.6 * np.random.default_rng(7).chisquare(ARCS, 100) / ARCS
     ratios[:3] = 20.0  # clutter
