@@ -1,4 +1,4 @@
-"""Check for epochs of a trajectory that jump away from the others and back."""
+"""Check for epochs of a trajectory that jump away from the others, and for joined trajectories."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import numpy as np
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.georef.trajectory import Motion
 from kgcp.georef.unix_time import date_of
-from kgcp.quality.checks.doubt import Cause, Doubt, mild
+from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
+from kgcp.quality.number_text import counted, rounded
 
 _MIN_JUMP_M = 1.5  # coordinates in degrees with five decimals have steps of 1.1 m
 _MAX_ACCELERATION_M_S2 = 10.0
@@ -22,6 +23,13 @@ _RETURN_SHARE = 0.5  # of the jump; a run of wrong epochs must return to the pat
 _MAX_RUN_S = 10.0  # two jumps farther apart may be two changes of the ambiguities
 _MAX_AT_END = 3  # epochs at an end; if there are more, they may be right and the others wrong
 _MIN_EPOCHS = 8  # in a trajectory, to decide which part is wrong
+_MIN_LASTING_JUMP_M = 10.0  # no other solution of the ambiguities is so far away
+_MAX_SPEED_M_S = 50.0  # over a gap, unless the vehicle is half as fast elsewhere
+_MIN_ALTERNATION_M = 0.2  # distance of two paths between which epochs alternate
+_JOINED_REMEDY = (
+    "if files of several vehicles, receivers or CRS were joined, make a flight folder of each;"
+    " 'kgcp export-gcp FLIGHT FLIGHT --out FOLDER' joins their points"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +110,20 @@ def check_spikes(motion: Motion) -> Iterator[Doubt]:
     A vehicle that brakes or turns also leaves the line between two epochs. A wrong epoch differs in
     that the path without it is smooth. A run of wrong epochs jumps away and returns within ten
     seconds; a jump without return is another solution of the ambiguities. Among the first and last
-    three epochs, those that jump away from all others are wrong.
+    three epochs, those that jump away from all others are wrong. Jumps of more than ten metres that
+    stay, and epochs that alternate between two paths, are those of several trajectories in one.
     """
+    whole = _Path(motion, np.arange(len(motion.time_s)))
+    apart_m = _alternation_m(whole)
+    if apart_m is not None:
+        yield grave(
+            Cause.TRAJECTORY_SPIKE,
+            f"the trajectory's epochs alternate between two paths {rounded(apart_m)} m apart"
+            " (median)",
+            _JOINED_REMEDY,
+            {"jump_m": apart_m},
+        )
+        return
     excursions: list[_Excursion] = []
     for search in (_single_epochs, _runs, _ends):
         path = _Path(motion, np.arange(len(motion.time_s))).without(excursions)
@@ -112,6 +132,69 @@ def check_spikes(motion: Motion) -> Iterator[Doubt]:
         excursions += search(path)
     if excursions:
         yield _doubt(excursions, motion)
+    yield from _lasting_jumps(whole.without(excursions))
+
+
+def _alternation_m(path: _Path) -> float | None:
+    """Return the distance of two paths between which all epochs alternate; None: there is one.
+
+    Every second epoch is then on a smooth path, without the others. On a single path, an epoch is
+    as far from the line between its second neighbours as from that between its neighbours, or
+    farther.
+    """
+    if len(path.epochs) < _MIN_EPOCHS:
+        return None
+    inner = np.arange(2, len(path.epochs) - 2)
+    off_m = float(np.median(np.linalg.norm(path.off_m[inner], axis=1)))
+    own_m = np.linalg.norm(path.off_line_m(inner - 2, inner, inner + 2), axis=1)
+    least_m = _MIN_ALTERNATION_M
+    if path.motion.sd_position_m is not None:
+        sd_m = np.linalg.norm(path.motion.sd_position_m, axis=1)
+        least_m = max(least_m, _MAX_SDS * float(np.median(sd_m)))
+    is_alternating = off_m > least_m and float(np.median(own_m)) < _SMOOTH_SHARE * off_m
+    return off_m if is_alternating else None
+
+
+def _lasting_jumps(path: _Path) -> Iterator[Doubt]:
+    """Yield the doubt about jumps after which the path goes on from another place."""
+    if len(path.epochs) < _MIN_EPOCHS:
+        return
+    steps = np.arange(1, len(path.epochs) - 2)
+    steps_s = np.diff(path.time_s)
+    jump_m, allowed_m = np.full(len(steps), np.inf), np.zeros(len(steps))
+    for neighbours in (steps - 1, steps + 1):
+        excess_m = np.linalg.norm(path.excess_m(steps, neighbours), axis=1)
+        jump_m = np.minimum(jump_m, excess_m)
+        change_m = 0.5 * _MAX_ACCELERATION_M_S2 * steps_s[steps]
+        allowed_m = np.maximum(allowed_m, change_m * (steps_s[steps] + steps_s[neighbours]))
+    if path.motion.sd_position_m is not None:
+        sd_m = np.linalg.norm(path.motion.sd_position_m[path.epochs], axis=1)
+        allowed_m += _MAX_SDS * np.maximum(sd_m[:-1], sd_m[1:])[steps]
+    move_m = np.linalg.norm(np.diff(path.position_m, axis=0), axis=1)[steps]
+    speed_m_s = move_m / steps_s[steps]
+    is_too_fast = speed_m_s > max(_MAX_SPEED_M_S, 2.0 * float(np.quantile(speed_m_s, 0.9)))
+    is_jump = (jump_m > allowed_m) | (is_too_fast & (steps_s[steps] > path.motion.max_gap_s))
+    least_m = max(_MIN_LASTING_JUMP_M, _MAX_RATIO * float(np.median(jump_m)))
+    size_m = np.where(steps_s[steps] > path.motion.max_gap_s, move_m, jump_m)
+    rows = np.flatnonzero(is_jump & (size_m > least_m))
+    if not rows.size:
+        return
+    worst = int(rows[np.argmax(size_m[rows])])
+    length = _metres(float(size_m[worst]))
+    after_utc = _utc(float(path.time_s[steps[worst]]))
+    others = len(rows) - 1
+    more = f", and at {counted(others, 'other place')} less far" if others else ""
+    yield grave(
+        Cause.TRAJECTORY_SPIKE,
+        f"the trajectory jumps by {length} in {rounded(float(steps_s[steps[worst]]))} s after"
+        f" {after_utc} UTC, and goes on from there{more}: no vehicle drives so",
+        _JOINED_REMEDY,
+        {"jump_m": float(size_m[worst]), "jumps": float(len(rows))},
+    )
+
+
+def _metres(length_m: float) -> str:
+    return f"{length_m:.0f} m" if length_m < 10_000.0 else f"{length_m / 1000.0:.0f} km"
 
 
 def _single_epochs(path: _Path) -> Iterator[_Excursion]:

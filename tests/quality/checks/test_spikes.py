@@ -147,3 +147,45 @@ def test_float_solutions_with_their_deviations_raise_no_doubt() -> None:
     sd_m[floats] = 1.0
     turns = np.broadcast_to(np.eye(3), (len(time_s), 3, 3)).copy()
     assert not [*check_spikes(Motion(time_s, position_m, turns, sd_m, None))]
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 5.0, 20.0])
+@pytest.mark.parametrize("gap_s", [0.0, 3.0])
+def test_a_jump_to_another_vehicle_or_height_is_grave(rate_hz: float, gap_s: float) -> None:
+    time_s = np.arange(0.0, 60.0, 1.0 / rate_hz)
+    time_s[time_s >= 20.0] += gap_s
+    position_m = driven(time_s)
+    position_m[time_s >= 20.0] += [0.0, 300.0, 0.0]
+    position_m[time_s >= 50.0] += [0.0, 0.0, 130.0]
+    (doubt,) = check_spikes(motion(time_s, position_m))
+    assert (doubt.code, doubt.is_grave) == (Cause.TRAJECTORY_SPIKE, True)
+    assert doubt.figures["jump_m"] == pytest.approx(
+        300.0, abs=25.0
+    )  # in a gap, the drive adds to it
+    assert doubt.figures["jumps"] == 2.0
+    assert "UTC, and goes on from there, and at 1 other place less far" in doubt.sentence
+
+
+def test_a_gap_that_no_vehicle_crosses_in_time_is_grave() -> None:
+    time_s = np.arange(0.0, 60.0, 0.05)
+    time_s[600:] += 7200.0
+    position_m = driven(time_s)
+    position_m[600:, 0] += 446_000.0  # easting of the next zone
+    (doubt,) = check_spikes(motion(time_s, position_m))
+    assert doubt.is_grave
+    assert "jumps by 446 km in 7200 s" in doubt.sentence
+    position_m[600:, 0] -= 346_000.0  # 100 km: by motorway
+    assert not [*check_spikes(motion(time_s, position_m))]
+
+
+@pytest.mark.parametrize("apart_m", [0.3, 3.0, 500.0])
+@pytest.mark.parametrize("shift_s", [0.012, 0.025])
+def test_epochs_of_two_vehicles_in_turn_are_grave(apart_m: float, shift_s: float) -> None:
+    time_s = np.arange(0.0, 60.0, 0.05)
+    first, second = driven(time_s), driven(time_s + shift_s)
+    second += [0.0, apart_m, 0.0]
+    times_s = np.column_stack((time_s, time_s + shift_s)).ravel()
+    (doubt,) = check_spikes(motion(times_s, np.stack((first, second), axis=1).reshape(-1, 3)))
+    assert doubt.is_grave
+    assert "alternate between two paths" in doubt.sentence
+    assert doubt.figures["jump_m"] == pytest.approx(apart_m, rel=0.05)
