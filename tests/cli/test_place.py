@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 
+import cv2
 import numpy as np
 import pandas as pd
 import pyarrow as pa
@@ -18,7 +19,7 @@ from click.testing import CliRunner, Result
 
 from kgcp.cli import main
 from kgcp.geometry.arrays import FloatArray
-from tests.ground_flight import GroundFlight
+from tests.ground_flight import CAMERA, GroundFlight
 
 
 def run(*arguments: object) -> Result:
@@ -399,3 +400,26 @@ def test_a_flight_without_a_readable_frame_is_reported(tmp_path: Path) -> None:
     assert result.exit_code == 1
     assert "has no readable frame" in result.stderr
     assert result.stderr.count("\n") == 1
+
+
+def test_heights_of_another_kind_are_a_grave_doubt_of_the_export(tmp_path: Path) -> None:
+    def export(folder: Path) -> Result:
+        arguments = ["export-gcp", str(folder), "--format", "csv"]
+        return CliRunner().invoke(main, arguments, catch_exceptions=False)
+
+    flight = GroundFlight()
+    folder = flight.write(tmp_path / "flight")
+    size = (CAMERA.height, CAMERA.width)
+    for name in flight.frame_names:
+        cv2.imwrite(str(folder / "frames" / name), np.zeros(size, np.uint8))
+    result = export(folder)
+    assert "doubt" not in result.stderr
+    path = folder / "flight.toml"
+    text = path.read_text(encoding="utf-8")
+    for position in flight.positions_map.tolist():
+        text = text.replace(str(position), str([*position[:2], position[2] + 12.0]))
+    path.write_text(text, encoding="utf-8")
+    result = export(folder)
+    assert "grave doubt: static targets: by the reference poses, all 4 lie alike 12 m down" in (
+        result.stderr
+    )

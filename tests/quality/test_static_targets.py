@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, ReferencePoses, opk_from_rotation
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.georef.sighting import Sighting
-from kgcp.georef.target_positions import TargetPosition
+from kgcp.georef.target_positions import TargetPosition, TargetPositions, Vehicle
+from kgcp.georef.trajectory import Motion
 from kgcp.quality.checks.doubt import Cause, Doubt
-from kgcp.quality.checks.static_targets import check_static_targets
+from kgcp.quality.checks.static_targets import check_places, check_static_targets, check_vehicle
+from kgcp.settings import VehicleSettings
 from tests.ground_flight import CAMERA, GroundFlight
 
 Changed = Callable[[int, str, Pose], tuple[str, Pose]]
@@ -303,3 +306,90 @@ def test_a_contradiction_in_one_of_three_frames_is_no_wrong_position() -> None:
 
     (doubt,) = check(seen(flight, taken), stated(flight))
     assert doubt.code is Cause.SINGLE_FRAMES
+
+
+def reference(flight: GroundFlight, sd_m: float | None) -> ReferencePoses:
+    """Poses as true as their standard deviations say; None: they state none."""
+    rng, frame = np.random.default_rng(7), flight.local_frame
+    centres = flight.centres + (sd_m or 0.0) * rng.standard_normal(flight.centres.shape)
+    to_map = np.swapaxes(frame.grid_rotation(flight.centres), 1, 2)
+    return ReferencePoses(
+        flight.frame_names,
+        frame.map_from_enu(centres),
+        opk_from_rotation(to_map @ flight.rotations @ CAMERA_FROM_PHOTO),
+        None if sd_m is None else np.full((flight.frames, 3), sd_m),
+        None if sd_m is None else np.full(flight.frames, 0.01),
+    )
+
+
+def check_by_poses(
+    flight: GroundFlight, off_m: FloatArray | float, sd_m: float | None = 0.02
+) -> tuple[Doubt, ...]:
+    poses = reference(flight, sd_m)
+    positions = stated(flight, off_m)
+    return tuple(check_places(seen(flight), positions, poses, CAMERA, flight.local_frame))
+
+
+@pytest.mark.parametrize("sd_m", [None, 0.02, 0.3])
+def test_positions_that_poses_confirm_raise_no_doubt(sd_m: float | None) -> None:
+    for seed in range(8):
+        rng = np.random.default_rng(200 + seed)
+        scale = 1.0 + 0.005 * rng.standard_normal()
+        flight = GroundFlight(seed=seed, stated_diameter_m=0.9 * scale)
+        assert check_by_poses(flight, SD_M * rng.standard_normal((4, 3)), sd_m) == ()
+
+
+@pytest.mark.parametrize("names", ["A", "ABCD"])
+def test_heights_or_datum_other_than_those_of_the_poses_are_grave(names: str) -> None:
+    """Also of a single target, to which no other can be compared."""
+    count = len(names)
+    flight = GroundFlight(names=tuple(names), offsets_m=GroundFlight().offsets_m[:count])
+    heights_m = np.array([0.0, 0.0, 40.0])
+    assert check(seen(flight), stated(flight, heights_m)) == ()
+    (doubt,) = check_by_poses(flight, heights_m)
+    assert (doubt.code, doubt.is_grave) == (Cause.STATIC_TARGETS, True)
+    assert "40 m down from" in doubt.sentence
+    assert doubt.figures["targets"] == count
+    (doubt,) = check_by_poses(flight, np.array([0.6, -0.5, 0.0]), None)
+    assert "0.6 m west and 0.5 m north from" in doubt.sentence
+    assert ("all 4 lie alike" in doubt.sentence) == (count == 4)
+
+
+def test_names_exchanged_between_two_targets_are_grave_by_poses() -> None:
+    """Their distance from each other is the same in either case."""
+    flight = GroundFlight(names=("A", "B"), offsets_m=GroundFlight().offsets_m[:2])
+    exchanged_m = flight.positions[::-1] - flight.positions
+    assert check(seen(flight), stated(flight, exchanged_m)) == ()
+    (doubt,) = check_by_poses(flight, exchanged_m)
+    assert "lies 8 m" in doubt.sentence
+    assert "2 of 2 targets do not fit" in doubt.sentence
+
+
+def beside_vehicle(flight: GroundFlight, sd_m: float | None) -> TargetPositions:
+    """The positions if the last target is on a vehicle that stands there."""
+    time_s = np.arange(100.0)
+    sd = None if sd_m is None else np.full((100, 3), sd_m)
+    axes = np.broadcast_to(np.eye(3), (100, 3, 3)).copy()
+    motion = Motion(time_s, np.tile(flight.positions[-1], (100, 1)), axes, sd, None)
+    vehicle = Vehicle(motion, VehicleSettings(), flight.local_frame)
+    static = {name: place for name, place in stated(flight).items() if name != "D"}
+    return TargetPositions(flight.local_frame, static, vehicle)
+
+
+@pytest.mark.parametrize("sd_m", [None, 0.02])
+def test_a_vehicle_that_is_not_where_targets_on_the_ground_see_it_is_grave(
+    sd_m: float | None,
+) -> None:
+    flight = GroundFlight()
+    places = beside_vehicle(flight, sd_m)
+    timed = [replace(each, time_s=10.0 + each.number) for each in seen(flight)]
+    assert [*check_vehicle(timed, places, CAMERA)] == []
+    for off_m in ([0.0, 0.0, 40.0], [1.2, 0.0, 0.0]):
+        static = {
+            name: replace(place, position_m=place.position_m + off_m)
+            for name, place in places.static.items()
+        }
+        (doubt,) = check_vehicle(timed, replace(places, static=static), CAMERA)
+        assert (doubt.code, doubt.is_grave) == (Cause.STATIC_TARGETS, True)
+        assert "D on the vehicle and" in doubt.sentence
+    assert [*check_vehicle(timed[:3], places, CAMERA)] == []  # a frame without the vehicle

@@ -96,7 +96,7 @@ class Cause(StrEnum):
     REFERENCE = "reference", "reference poses are of another place, or rotated"
     STATIC_TARGETS = (
         "static_targets",
-        "a static target is not at its position_m, as its distances to the others show",
+        "a static target is not at its position_m, as reference poses or the other targets show",
     )
     CAMERA_POSITION = (
         "camera_position",

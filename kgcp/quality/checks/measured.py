@@ -18,7 +18,11 @@ from kgcp.quality.checks.encounters import Encounters
 from kgcp.quality.checks.frame_header import FrameHeader
 from kgcp.quality.checks.mount import check_mount
 from kgcp.quality.checks.patterns import check_lone_frames, unexplained
-from kgcp.quality.checks.static_targets import check_static_targets
+from kgcp.quality.checks.static_targets import (
+    check_places,
+    check_static_targets,
+    check_vehicle,
+)
 from kgcp.quality.checks.stretch import check_stretch
 from kgcp.quality.consistency import Consistency
 
@@ -46,11 +50,15 @@ def measured_doubts(
     consistency : Consistency or None
         From the same sightings and poses.
     """
-    doubts = [
-        *plausibility,
-        *_of_altitude(sightings, headers),
-        *check_static_targets(sightings, target_positions.static, camera),
-    ]
+    static = target_positions.static
+    of_static = [*check_static_targets(sightings, static, camera)]
+    if not any(doubt.is_grave for doubt in (*plausibility, *of_static)):
+        of_static += (
+            check_vehicle(sightings, target_positions, camera)
+            if poses is None
+            else check_places(sightings, static, poses, camera, target_positions.local_frame)
+        )
+    doubts = [*plausibility, *_of_altitude(sightings, headers), *of_static]
     # If an input is certainly wrong, everything that follows from it disagrees.
     if poses is not None and not any(doubt.is_grave for doubt in plausibility):
         encounters = Encounters.of(sightings, target_positions, poses, camera)

@@ -1,4 +1,4 @@
-"""Check of static targets against each other, which needs no pose of the camera."""
+"""Checks of static targets against each other, without poses, and against reference poses."""
 
 from __future__ import annotations
 
@@ -6,14 +6,18 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.camera import Camera
+from kgcp.georef.exterior_orientation import ExteriorOrientations
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.sighting import Sighting, unmistakable
-from kgcp.georef.target_positions import TargetPosition
+from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
 from kgcp.quality.number_text import rounded
 
@@ -27,6 +31,11 @@ _SPEED_M_S = 10.0  # of the camera, while a rolling shutter reads the frame
 _MAX_LOG_SCALE = 0.02  # of a common factor of all distances
 _MIN_PAIRS = 3  # of targets, that distinguish a common factor from a wrong position
 _MAX_NAMED = 3  # measurements in a message
+# Standard deviations of an image, by errors of the calibration, and with poses that state none.
+_CALIBRATION_SD_PX, _UNSTATED_POSE_SD_PX = 2.0, 5.0
+_MIN_OFF_M = 0.05  # of a target from its position, by reference poses
+_MIN_VEHICLE_OFF_M = 0.1  # of a distance between the targets on vehicle and ground
+_ALIKE_SHARE = 0.2  # of their offset, by which targets differ that all lie alike
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,6 +86,166 @@ def check_static_targets(
         yield _target_doubt(by_names, bad, contradicting, scale)
     else:
         yield from _frame_doubts(pairs, wrong)
+
+
+def check_vehicle(
+    sightings: Sequence[Sighting], target_positions: TargetPositions, camera: Camera
+) -> Iterator[Doubt]:
+    """Compare the distances between targets on vehicle and ground with those of their positions."""
+    static = target_positions.static
+    on_ground: dict[str, list[Sighting]] = defaultdict(list)
+    moving = []
+    for each in unmistakable(sightings):
+        if each.target in static:
+            on_ground[each.frame].append(each)
+        else:
+            moving.append(each)
+    moving = [each for each in moving if each.frame in on_ground]
+    if not moving:
+        return
+    times_s = [each.row_time_s(camera) for each in moving]
+    positions = target_positions.positions([each.target for each in moving], times_s)
+    pairs = []
+    for on_vehicle, position in zip(moving, positions, strict=True):
+        if not isinstance(position, TargetPosition):
+            continue
+        unstated = replace(position, cov_m2=_MIN_VEHICLE_OFF_M**2 * np.eye(3))
+        places = {**static, on_vehicle.target: unstated if position.cov_m2 is None else position}
+        for other in on_ground[on_vehicle.frame]:
+            sighting_of = {on_vehicle.target: on_vehicle, other.target: other}
+            names = on_vehicle.target, other.target
+            pair = _pair(on_vehicle.frame, names, sighting_of, places, camera)
+            pairs += [] if pair is None else [pair]
+    wrong = [
+        pair
+        for pair in pairs
+        if abs(_off_m(pair, 1.0)) > max(_MIN_VEHICLE_OFF_M, _CONTRADICTION_SDS * pair.sd_m)
+    ]
+    if len(wrong) >= max(_MIN_FRAMES, _MIN_SHARE * len(pairs)):
+        worst = sorted(wrong, key=lambda pair: abs(_off_m(pair, 1.0)))[len(wrong) // 2]
+        off_m = _off_m(worst, 1.0)
+        yield grave(
+            Cause.STATIC_TARGETS,
+            f"{worst.names[0]} on the vehicle and {worst.names[1]} on the ground are"
+            f" {_closer_text(off_m)} each other in {worst.frame} than by trajectory and position_m;"
+            f" {len(wrong)} of {len(pairs)} such distances do not fit",
+            "check times, lever_arm_m, and whether trajectory and position_m have one datum and"
+            " heights of one kind",
+            {"off_m": off_m, "comparisons": float(len(wrong))},
+        )
+
+
+def check_places(
+    sightings: Sequence[Sighting],
+    positions: Mapping[str, TargetPosition],
+    poses: ReferencePoses,
+    camera: Camera,
+    local_frame: LocalFrame,
+) -> Iterator[Doubt]:
+    """Compare the places of static targets by reference poses with their positions.
+
+    Parameters
+    ----------
+    positions : mapping of str to TargetPosition
+        Positions of the static targets in the ENU frame `local_frame`.
+    """
+    rows = {frame: row for row, frame in enumerate(poses.frames)}
+    orientations = ExteriorOrientations.of(poses, local_frame)
+    offsets_m: dict[str, list[FloatArray]] = defaultdict(list)
+    covs_m2: dict[str, list[FloatArray]] = defaultdict(list)
+    for each in unmistakable(sightings):
+        if each.target in positions and each.pose is not None and each.frame in rows:
+            row, place = rows[each.frame], positions[each.target]
+            axes = orientations.enu_from_camera[row]
+            sight_m = axes @ each.pose.translation_m
+            offsets_m[each.target].append(orientations.centre_m[row] + sight_m - place.position_m)
+            cov = _place_cov(each, sight_m, axes, poses, orientations, row, camera)
+            covs_m2[each.target].append(cov + (0.0 if place.cov_m2 is None else place.cov_m2))
+    off_m = {
+        name: np.median(offsets, axis=0)
+        for name, offsets in offsets_m.items()
+        if len(offsets) >= _MIN_FRAMES
+    }
+    wrong = {}
+    for name, off in off_m.items():
+        cov = np.mean(covs_m2[name], axis=0)  # most errors are the same in all frames
+        chi2 = float(off @ np.linalg.solve(cov, off))
+        if chi2 > _CONTRADICTION_SDS**2 and np.linalg.norm(off) > _MIN_OFF_M:
+            wrong[name] = off
+    if wrong:
+        yield _place_doubt(wrong, len(off_m))
+
+
+def _place_cov(
+    sighting: Sighting,
+    sight_m: FloatArray,
+    enu_from_camera: FloatArray,
+    poses: ReferencePoses,
+    orientations: ExteriorOrientations,
+    row: int,
+    camera: Camera,
+) -> FloatArray:
+    """Return the covariance (3, 3) of a target's place by one frame, ENU axes [m²].
+
+    `sight_m` (3,) leads from the camera to the target, in the same axes.
+    """
+    distance_m = float(np.linalg.norm(sight_m))
+    share = max(_PRINT_SD, (sighting.sd_common_distance_m or 0.0) / sighting.distance_m)
+    along = np.outer(sight_m, sight_m)
+    cov = share**2 * along
+    if sighting.pose_cov is not None:
+        cov = cov + enu_from_camera @ sighting.pose_cov[:3, :3] @ enu_from_camera.T
+    sd_px = _CALIBRATION_SD_PX
+    if orientations.cov_m2 is None or poses.sd_angle_deg is None:
+        sd_px = _UNSTATED_POSE_SD_PX
+    else:
+        across = distance_m**2 * np.eye(3) - along
+        cov = cov + orientations.cov_m2[row]
+        cov = cov + math.radians(float(poses.sd_angle_deg[row])) ** 2 * across
+    rows = sighting.rows_since_middle(camera)
+    shift_m = _SPEED_M_S * camera.readout_s * rows
+    variance = _OTHER_SD_M**2 + (sd_px * distance_m / camera.mean_focal_px) ** 2 + shift_m**2
+    return np.asarray(cov + variance * np.eye(3))
+
+
+def _place_doubt(wrong: Mapping[str, FloatArray], targets: int) -> Doubt:
+    """Return the doubt about targets that are not at their positions: one of them, or all alike."""
+    names = sorted(wrong, key=lambda name: -float(np.linalg.norm(wrong[name])))
+    usual_m = np.median([*wrong.values()], axis=0)
+    apart_m = max(float(np.linalg.norm(off - usual_m)) for off in wrong.values())
+    figures = {"off_m": float(np.linalg.norm(wrong[names[0]])), "targets": float(len(wrong))}
+    if targets > 1 and len(wrong) == targets:
+        figures["off_m"] = float(np.linalg.norm(usual_m))
+        if apart_m < _ALIKE_SHARE * figures["off_m"]:
+            return grave(
+                Cause.STATIC_TARGETS,
+                f"static targets: by the reference poses, all {targets} lie alike"
+                f" {_enu_text(usual_m)} from position_m",
+                "give position_m, reference poses and crs in one datum, with heights of one kind:"
+                " ellipsoidal or above the geoid",
+                figures,
+            )
+    others = f"; {len(wrong)} of {targets} targets do not fit" if len(wrong) > 1 else ""
+    return grave(
+        Cause.STATIC_TARGETS,
+        f"static targets: by the reference poses, {names[0]} lies {_enu_text(wrong[names[0]])} from"
+        f" its position_m{others}",
+        "check position_m, the names, the reference poses, and whether a target was moved; 'kgcp"
+        " place' shows all",
+        figures,
+    )
+
+
+def _enu_text(off_m: FloatArray) -> str:
+    """Return an offset (3,) in words, without the axes in which it is small."""
+    least_m = 0.1 * float(np.abs(off_m).max())
+    words = (("east", "west"), ("north", "south"), ("up", "down"))
+    parts = [
+        f"{rounded(abs(value))} m {there if value > 0.0 else back}"
+        for value, (there, back) in zip(off_m.tolist(), words, strict=True)
+        if abs(value) > least_m
+    ]
+    return _and(parts)
 
 
 def _pairs(
@@ -189,14 +358,19 @@ def _target_doubt(
     off_m = float(np.median([_off_m(pair, scale) for pair in bad[worst]]))
     return grave(
         Cause.STATIC_TARGETS,
-        f"static targets: {worst[0]} and {worst[1]} are {rounded(abs(off_m))} m"
-        f" {'farther from' if off_m > 0.0 else 'closer to'} each other in the images than by"
+        f"static targets: {worst[0]} and {worst[1]} are {_closer_text(off_m)} each other in the"
+        " images than by"
         f" position_m, in {len(bad[worst])} of {len(by_names[worst])} frames;"
         f" {_and(blamed)} contradict{'s' * (len(blamed) == 1)} most others",
         "check position_m, the names, and whether a target was moved; 'kgcp place' and"
         " 'kgcp orient' show more",
         {"off_m": off_m, "frames": float(len(bad[worst]))},
     )
+
+
+def _closer_text(off_m: float) -> str:
+    """Return by how much two targets are farther from, or closer to, each other."""
+    return f"{rounded(abs(off_m))} m {'farther from' if off_m > 0.0 else 'closer to'}"
 
 
 def _frame_doubts(pairs: Sequence[_Pair], wrong: AbstractSet[_Pair]) -> Iterator[Doubt]:
