@@ -151,6 +151,19 @@ def test_positions_as_good_as_stated_contradict_nothing(tmp_path: Path, seed: in
     assert 0.2 < float(np.sqrt(np.mean((off / sds) ** 2))) < 1.7
 
 
+def test_positions_without_stated_accuracy_are_named(tmp_path: Path) -> None:
+    """Their errors are not part of the poses' standard deviations."""
+    folder = GroundFlight().write(tmp_path / "flight")
+    assert "doubt" not in run("orient", folder).stderr
+    path = folder / "flight.toml"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace("sd_position_m", "# sd_position_m"), encoding="utf-8")
+    result = run("orient", folder, "--json")
+    (doubt,) = json.loads(result.stdout)["doubts"]
+    assert doubt.startswith("sd_position_m is not stated for A, B, C and 1 more: ")
+    assert doubt in result.stderr
+
+
 def test_a_failure_to_orient_most_frames_is_reported(tmp_path: Path) -> None:
     exchanged = {
         (frame, name): other for frame in range(8) for name, other in (("A", "B"), ("B", "A"))

@@ -36,6 +36,8 @@ from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.number_text import rounded
 
 _SIGNIFICANT_SIGMAS = 3.0  # a larger common scale of the distances is reported
+_MIN_SCALE = 1e-4  # of the distances, that is reported; no print or survey is better
+_MAX_NAMED = 3  # targets in a message
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,13 +143,31 @@ class FlightPoses:
             )
         if self.distance_scale is not None:
             share, sd = self.distance_scale
-            if abs(share) > _SIGNIFICANT_SIGMAS * sd:
+            if abs(share) > max(_MIN_SCALE, _SIGNIFICANT_SIGMAS * sd):
                 doubts.append(
                     f"the distances are {1000.0 * abs(share):.1f} ‰ (± {1000.0 * sd:.1f})"
                     f" {'longer' if share > 0.0 else 'shorter'} than the positions say; look at the"
                     " targets' diameters and at the focal length"
                 )
+        unstated = self._targets_counted_as_exact
+        if unstated:
+            more = f" and {len(unstated) - _MAX_NAMED} more" if len(unstated) > _MAX_NAMED else ""
+            doubts.append(
+                f"sd_position_m is not stated for {', '.join(unstated[:_MAX_NAMED])}{more}: the"
+                " standard deviations of the poses count these positions as exact; state in"
+                " flight.toml how accurate they are, and repeat the command"
+            )
         return tuple(doubts)
+
+    @property
+    def _targets_counted_as_exact(self) -> list[str]:
+        """Targets that orient frames, without standard deviations of their positions."""
+        used = {name for each in self.oriented for name in each.used}
+        return [
+            target.name
+            for target in self.flight.all_targets
+            if target.name in used and not any(target.sd_position_m)
+        ]
 
     def summary(self) -> dict[str, object]:
         """Return all numbers for machines."""
