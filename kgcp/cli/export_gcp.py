@@ -55,9 +55,8 @@ def _list_formats(context: click.Context, _: click.Parameter, asked: bool) -> No
     "formats",
     type=click.Choice([*FORMATS, ALL]),
     multiple=True,
-    default=DEFAULT_FORMATS,
     help="Format to write besides kgcps.parquet; may be repeated; 'all' skips formats that cannot"
-    " hold these points.  [default: csv, odm]",
+    f" hold these points.  [default: {', '.join(DEFAULT_FORMATS)}]",
 )
 @click.option(
     "--list-formats",
@@ -273,14 +272,14 @@ def _made(flights: Sequence[tuple[Flight, Path]], choice: PointChoice) -> list[G
 def _export(
     formats: tuple[str, ...], write: Callable[[str], list[Path]]
 ) -> tuple[list[Path], dict[str, str]]:
-    """Write the named formats; with `all`, every format that can hold the points.
+    """Write the named formats; of the default ones or with `all`, those that can hold the points.
 
     Returns the paths, and by format why it was left out.
     """
     from kgcp.errors import KgcpError
 
     written, left_out = [], {}
-    for name in FORMATS if ALL in formats else dict.fromkeys(formats):
+    for name in FORMATS if ALL in formats else dict.fromkeys(formats or DEFAULT_FORMATS):
         try:
             written += write(name)
         except KgcpError as error:
