@@ -6,6 +6,7 @@ import json
 import shutil
 from pathlib import Path
 
+import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
@@ -157,3 +158,30 @@ def test_tables_record_what_they_were_made_from(measured: SampleFlight) -> None:
     assert measured.run("export-gcp", "--format", "csv").exit_code == 0
     after = json.loads(metadata(measured.out / "kgcps.parquet")["digests"])
     assert {part for part in after if after[part] != before[part]} == {"vehicle"}
+
+
+def test_a_table_that_pandas_wrote_is_used_with_a_warning(measured: SampleFlight) -> None:
+    path = measured.out / "detections.parquet"
+    table = pd.read_parquet(path)
+    table[table["status"] == "measured"].to_parquet(path)
+    result = measured.run("export-gcp")
+    assert result.exit_code == 0, result.output
+    assert "kgcp: warning: " in result.stderr
+    assert "a camera or targets changed since 'kgcp detect' would go unnoticed" in result.stderr
+    table["time"] += pd.Timedelta(hours=2)
+    table.to_parquet(path)
+    line = measured.fails("export-gcp")
+    assert f"[frames] times of {table['frame'].nunique()} of" in line
+    assert "(by -7200 s)" in line
+
+
+def test_tables_that_pandas_joined_may_have_frames_of_another_flight(
+    measured: SampleFlight,
+) -> None:
+    path = measured.out / "detections.parquet"
+    table = pd.read_parquet(path)
+    other = table.assign(frame="other_" + table["frame"])
+    pd.concat([table, other]).to_parquet(path)
+    result = measured.run("export-gcp", "--format", "csv")
+    assert result.exit_code == 0, result.output
+    assert "other_" in (measured.out / "kgcps.csv").read_text(encoding="utf-8")

@@ -74,7 +74,7 @@ def _table(schema: pa.Schema, rows: Iterable[Row]) -> pa.Table:
 
 
 def read_table(path: Path, columns: Sequence[Column[Any]]) -> pd.DataFrame:
-    """Read a table that `write_table` wrote.
+    """Read a table that `write_table` wrote, or pandas from such a table.
 
     Raises
     ------
@@ -97,9 +97,26 @@ def read_table(path: Path, columns: Sequence[Column[Any]]) -> pd.DataFrame:
         raise KgcpError(
             f"{path}: lacks the columns {', '.join(missing)}; remake it with this version of kgcp"
         )
+    table = _with_declared_types(table, columns)
     _check_columns(path, table, columns)
     frame: pd.DataFrame = table.to_pandas()
     return frame
+
+
+def _with_declared_types(table: pa.Table, columns: Sequence[Column[Any]]) -> pa.Table:
+    """Return a table with the types of `write_table` where pandas writes another for them.
+
+    These are texts of any length, and columns without a value.
+    """
+    for column in columns:
+        index = table.schema.get_field_index(column.name)  # -1: occurs twice
+        declared = _ARROW_TYPES[column.type]
+        actual = table.schema.field(index).type if index >= 0 else declared
+        is_text = pa.types.is_large_string(actual) and column.type is ColumnType.TEXT
+        if is_text or pa.types.is_null(actual):
+            cells = table.column(index).cast(declared)
+            table = table.set_column(index, pa.field(column.name, declared), cells)
+    return table
 
 
 def _check_version(path: Path, metadata: Mapping[bytes, bytes]) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from kgcp.errors import KgcpError
+from kgcp.errors import KgcpError, KgcpWarning
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.io.files.safe_read import unreadable
@@ -70,7 +71,8 @@ def require_current(path: Path, table: pd.DataFrame, flight: Flight) -> None:
     """Refuse detections that were made from another camera, other targets, times or frames.
 
     Inputs that later commands read anew may differ: trajectory, lever arm, CRS, reference poses. A
-    table that does not state its inputs passes: kgcp did not write it.
+    table that does not state its inputs passes: kgcp did not write it. If pandas wrote it, its
+    times are compared with those of the flight, and a warning says that nothing else is.
 
     Parameters
     ----------
@@ -85,6 +87,8 @@ def require_current(path: Path, table: pd.DataFrame, flight: Flight) -> None:
     metadata = pq.read_schema(path).metadata or {}
     inputs = _json(metadata, b"kgcp.inputs")
     if not inputs:
+        if b"pandas" in metadata:
+            _check_joined(path, table, flight)
         return
     digests = _json(metadata, b"kgcp.digests")
     frames_now = _frames_now(flight)
@@ -95,14 +99,34 @@ def require_current(path: Path, table: pd.DataFrame, flight: Flight) -> None:
         *_changed_frames(table, flight, metadata, chosen),
     ]
     if changes:
-        not_shown = len(changes) - _MAX_CHANGES_SHOWN
-        listed = ", ".join(
-            [*changes[:_MAX_CHANGES_SHOWN], *([f"{not_shown} more"] if not_shown > 0 else [])]
-        )
-        raise KgcpError(
-            f"{path}: does not belong to this flight any more; changed since 'kgcp detect':"
-            f" {listed}; {_remedy(path, flight, _json(metadata, b'kgcp.settings'))}"
-        )
+        raise _outdated(path, flight, changes, _json(metadata, b"kgcp.settings"))
+
+
+def _check_joined(path: Path, table: pd.DataFrame, flight: Flight) -> None:
+    """Refuse a table of pandas with times other than the flight's, and warn of what is unknown."""
+    changes = [*_changed_times(table, flight, {}, _frames_now(flight))]
+    if changes:
+        raise _outdated(path, flight, changes, {})
+    warnings.warn(
+        f"{path}: pandas wrote it, without what it was made from; a camera or targets changed since"
+        " 'kgcp detect' would go unnoticed: leave rows out with --exclude, and give 'kgcp"
+        " export-gcp' several flights instead of joining their tables",
+        KgcpWarning,
+        stacklevel=2,
+    )
+
+
+def _outdated(
+    path: Path, flight: Flight, changes: Sequence[str], settings: Mapping[str, object]
+) -> KgcpError:
+    not_shown = len(changes) - _MAX_CHANGES_SHOWN
+    listed = ", ".join(
+        [*changes[:_MAX_CHANGES_SHOWN], *([f"{not_shown} more"] if not_shown > 0 else [])]
+    )
+    return KgcpError(
+        f"{path}: does not belong to this flight any more; changed since 'kgcp detect':"
+        f" {listed}; {_remedy(path, flight, settings)}"
+    )
 
 
 def _frames_now(flight: Flight) -> list[str] | None:
@@ -197,6 +221,7 @@ def _changed_times(
 ) -> Iterator[str]:
     """Yield a change if frames have other times now, or no longer have one.
 
+    Without `digests`, frames that have no time then or now may be those of another flight.
     A times file without names can only be assigned to `all_frames`; a table of chosen frames does
     not have them.
     """
@@ -213,9 +238,12 @@ def _changed_times(
         is_exif = (frames["time_source"] == TimeSource.EXIF.value).to_numpy()
         now_s = np.where(np.isnan(now_s) & is_exif, then_s, now_s)
     is_same = (np.abs(now_s - then_s) <= _TIME_TOLERANCE_S) | (np.isnan(now_s) & np.isnan(then_s))
+    if not digests:
+        is_same |= np.isnan(now_s) | np.isnan(then_s)
     changed = np.flatnonzero(~is_same)
     if not changed.size:
-        yield "[frames] times"
+        if digests:
+            yield "[frames] times"
         return
     changed_times = f"[frames] times of {len(changed)} of {len(frames)} frames"
     shifts_s = (now_s - then_s)[changed]
