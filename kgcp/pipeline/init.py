@@ -20,7 +20,7 @@ from kgcp.io.flight.target_table import target_lines
 from kgcp.io.flight.toml_draft import MISSING, DraftKey, DraftText
 from kgcp.io.formats.frame_times import read_times
 from kgcp.io.formats.name_times import times_of_names
-from kgcp.io.formats.point_table import PointTable
+from kgcp.io.formats.point_table import PointTable, require_one_place
 from kgcp.io.images.exif import read_frame_header
 from kgcp.pipeline.init_camera import camera_section
 from kgcp.pipeline.init_records import Gap, InitFinding, InitOptions, Part, Section
@@ -32,6 +32,7 @@ from kgcp.targets.layout import Target
 
 _FRAMES_CSV = "frames.csv"
 _NO_OPTIONS = InitOptions()
+_SHOWN_NAMES = 4  # of surveyed points
 _HEAD = (
     '# Written by kgcp init from the files of this folder. Lines "# key = value" are comments and',
     f"# set nothing; fill in those marked {MISSING}. docs/flight_toml.md explains every key.",
@@ -219,6 +220,7 @@ def _targets_section(
     if positions_m:
         files = ", ".join(contents.relative(points.path) for points in surveyed)
         found.append(InitFinding("positions", f"of {', '.join(sorted(positions_m))}, from {files}"))
+    found += [_unused(points, contents) for points in contents.points if points not in surveyed]
     is_carried = bool(contents.trajectories)
     unplaced = [
         each.name
@@ -238,6 +240,15 @@ def _targets_section(
         " with the columns name, x, y, z into the folder before kgcp init",
     )
     return Section(blocks, tuple(found), (gap,) if unplaced else ()), surveyed
+
+
+def _unused(points: PointTable, contents: FolderContents) -> InitFinding:
+    """Say that no target has the name of a point: 001 is not 1."""
+    shown = ", ".join(points.names[:_SHOWN_NAMES])
+    more = " …" if len(points.names) > _SHOWN_NAMES else ""
+    return InitFinding(
+        "not used", f"{contents.relative(points.path)}: no target has its names, {shown}{more}"
+    )
 
 
 def _block(
@@ -272,13 +283,16 @@ def _surveyed_positions(
 ) -> tuple[dict[str, tuple[float, float, float]], tuple[PointTable, ...]]:
     """Return the surveyed positions of targets by name, and the tables of points that have them."""
     positions_m: dict[str, tuple[float, float, float]] = {}
-    used = []
+    used: list[PointTable] = []
     names = {target.name for target in targets}
     for points in contents.points:
-        own = {name: position_m for name, position_m in points.positions().items() if name in names}
+        own = points.positions(names)
+        for name in own.keys() & positions_m.keys():
+            files = f"{used[-1].path}, {points.path}"
+            require_one_place(name, positions_m[name], own[name], files)
         if own:
             used.append(points)
-            positions_m = {**own, **positions_m}
+            positions_m |= own
     return positions_m, tuple(used)
 
 

@@ -91,7 +91,8 @@ def _missing_trajectory_parts(contents: FolderContents) -> Iterator[Part]:
         yield InitFinding(
             "not recognised",
             f"{shown}{more}; a table is recognised as a trajectory if its first line names time,"
-            " and x, y, z or longitude, latitude, height, in degrees and metres",
+            " and x, y, z or longitude, latitude, height, in degrees and metres, and as one of"
+            " surveyed points if it names name, x, y, z; in UTF-8",
         )
 
 

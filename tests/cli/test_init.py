@@ -224,6 +224,35 @@ def test_exif_alone_gives_a_guess_that_check_keeps_naming(
     assert "guess" not in CliRunner().invoke(main, ["check", str(folder)]).stdout
 
 
+def test_surveyed_points_may_be_named_p_but_have_one_place(bare: Path, tmp_path: Path) -> None:
+    folder = copied(bare, "static", tmp_path)
+    row = "T1,689432.0,5336173.0,545.6\n"
+    (folder / "points.csv").write_text("P,E,N,H\n" + 2 * row, encoding="utf-8")
+    flight, _, _ = made(folder, *TARGET)
+    assert flight.targets[0].position_m == (689432.0, 5336173.0, 545.6)
+    other = row.replace("432.0", "432.4")
+    for name, text in (("points.csv", row + other), ("again.csv", other)):
+        (folder / "flight.toml").unlink()
+        (folder / "points.csv").write_text("P,E,N,H\n" + row, encoding="utf-8")
+        (folder / name).write_text("P,E,N,H\n" + text, encoding="utf-8")
+        result = CliRunner().invoke(main, ["init", str(folder), *TARGET])
+        assert result.exit_code == 1
+        assert "the point 'T1' has two places: " in result.stderr
+        assert "689432.4, 5336173, 545.6" in result.stderr
+        (folder / "flight.toml").touch()
+
+
+def test_surveyed_points_with_other_names_are_said_not_to_be_used(
+    bare: Path, tmp_path: Path
+) -> None:
+    folder = copied(bare, "static", tmp_path)
+    rows = "".join(f"t{n},689432.0,5336173.0,545.6\n" for n in range(1, 7))
+    (folder / "points.csv").write_text(f"name,x,y,z\n{rows}", encoding="utf-8")
+    flight, _, said = made(folder, *TARGET)
+    assert flight.targets[0].position_m is None
+    assert "points.csv: no target has its names, t1, t2, t3, t4 …" in " ".join(said.split())
+
+
 def csv_rows(separator: str, decimal: str, kind: str) -> str:
     """The plan's trajectory as tables of other programs."""
     trajectory = PLAN.trajectory

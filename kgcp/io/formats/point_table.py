@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from kgcp.io.files.csv_columns import read_csv_columns
+from kgcp.errors import KgcpError
+from kgcp.io.files.csv_columns import CsvColumns, read_csv_columns
 from kgcp.io.files.csv_sniff import SniffedTable, sniff_table
 from kgcp.io.files.sniff import ForeignFile
 
@@ -14,7 +15,7 @@ _XYZ = ("x", "y", "z")
 _COLUMNS: Mapping[str, Sequence[str]] = {
     "name": (
         *("name", "id", "point", "pointname", "pointid", "label", "target", "punkt", "punktnummer"),
-        *("pktnr", "nr"),
+        *("pktnr", "nr", "p", "pt", "pkt"),
     ),
     "x": ("x", "e", "east", "easting", "ostwert", "rechtswert", "longitude", "lon", "long"),
     "y": ("y", "n", "north", "northing", "nordwert", "hochwert", "latitude", "lat"),
@@ -38,19 +39,57 @@ class PointTable:
         x, y = self.table.number("x"), self.table.number("y")
         return None if x is None or y is None else (x, y)
 
-    def positions(self) -> dict[str, tuple[float, float, float]]:
-        """Return x, y, z of all points by name, the first of each name.
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all points, in their order.
 
         Raises
         ------
         KgcpError
-            Naming the line of a cell that is not a number.
+            If the file cannot be read.
         """
-        columns = read_csv_columns(self.path, ("name",), _XYZ, (), "", self.table.layout)
+        return self._columns.texts["name"]
+
+    def positions(self, names: Collection[str]) -> dict[str, tuple[float, float, float]]:
+        """Return x, y, z of the points with these names.
+
+        Raises
+        ------
+        KgcpError
+            Naming the line of a cell that is not a number, or a point with several places.
+        """
+        columns = self._columns
         places: dict[str, tuple[float, float, float]] = {}
         for name, row in zip(columns.texts["name"], columns.block(_XYZ).tolist(), strict=True):
-            places.setdefault(name, (row[0], row[1], row[2]))
+            if name in names:
+                place = (row[0], row[1], row[2])
+                require_one_place(name, places.setdefault(name, place), place, str(self.path))
         return places
+
+    @property
+    def _columns(self) -> CsvColumns:
+        return read_csv_columns(self.path, ("name",), _XYZ, (), "", self.table.layout)
+
+
+def require_one_place(
+    name: str, first: tuple[float, float, float], other: tuple[float, float, float], where: str
+) -> None:
+    """Refuse a point that has two places.
+
+    Raises
+    ------
+    KgcpError
+        If the places differ.
+    """
+    if first != other:
+        raise KgcpError(
+            f"{where}: the point {name!r} has two places: {_text(first)} and {_text(other)}; keep"
+            " the right one"
+        )
+
+
+def _text(place: tuple[float, float, float]) -> str:
+    return ", ".join(f"{value:.10g}" for value in place)
 
 
 def recognised_points(file: ForeignFile) -> PointTable | None:
