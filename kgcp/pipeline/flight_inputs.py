@@ -39,6 +39,7 @@ from kgcp.quality.checks.course import Course, check_attitude, course_of
 from kgcp.quality.checks.deviations import (
     check_deviations,
     check_pose_deviations,
+    check_target_deviations,
     check_vehicle_deviations,
 )
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild, ranked
@@ -228,6 +229,7 @@ class FlightInputs:
         doubts = [
             *check_camera(flight.camera, is_guessed=flight.is_camera_guessed),
             *check_plates(flight.all_targets),
+            *check_target_deviations(flight.all_targets),
             *check_frames(self.headers, flight.camera),
             *self._doubts_of_places(),
             *self._doubts_of_times(),

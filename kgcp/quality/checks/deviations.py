@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -10,10 +10,13 @@ from kgcp.geometry.arrays import BoolArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.georef.trajectory import Motion
 from kgcp.quality.checks.doubt import Cause, Doubt, mild
+from kgcp.quality.number_text import counted
 from kgcp.settings import VehicleSettings
+from kgcp.targets.plain import AnyTarget
 
 _MIN_SD_M, _MAX_SD_M = 0.0005, 10.0  # usual range of a receiver's positions
 _MAX_LEVER_ARM_SD_M, _MAX_TIME_SD_S = 0.5, 0.5
+_MAX_TARGET_SD_M = 5.0  # a hand-held receiver is better
 _REMEDY = (
     "give those of the receiver's software, or remove their columns from the trajectory's file"
 )
@@ -67,6 +70,20 @@ def check_vehicle_deviations(settings: VehicleSettings) -> Iterator[Doubt]:
                 f"give it in {unit}, not in m{unit}",
                 {key: value},
             )
+
+
+def check_target_deviations(targets: Iterable[AnyTarget]) -> Iterator[Doubt]:
+    """Yield the doubt about deviations of static targets that seem to be in millimetres."""
+    large = [target for target in targets if max(target.sd_position_m) > _MAX_TARGET_SD_M]
+    if large:
+        sd_m = max(large[0].sd_position_m)
+        others = f", and that of {counted(len(large) - 1, 'other target')}" if large[1:] else ""
+        yield mild(
+            Cause.STANDARD_DEVIATIONS,
+            f"sd_position_m of {large[0].name} is {sd_m:g} m{others}, which suggests millimetres",
+            "give it in m, not in mm",
+            {"sd_m": sd_m, "targets": float(len(large))},
+        )
 
 
 def _zeros(is_zero: BoolArray, values: str, rows: str, effect: str, remedy: str) -> Iterator[Doubt]:

@@ -11,10 +11,12 @@ from kgcp.georef.trajectory import Motion
 from kgcp.quality.checks.deviations import (
     check_deviations,
     check_pose_deviations,
+    check_target_deviations,
     check_vehicle_deviations,
 )
 from kgcp.quality.checks.doubt import Cause
 from kgcp.settings import VehicleSettings
+from kgcp.targets.layout import Ring, Target
 
 _SD = np.full((5, 3), 0.02)
 _MOTION = Motion(np.arange(5.0), np.zeros((5, 3)), np.tile(np.eye(3), (5, 1, 1)), _SD, _SD)
@@ -85,3 +87,13 @@ def test_deviations_of_the_vehicle_in_thousandths_are_doubted() -> None:
     )
     assert arm.remedy == "give it in m, not in mm"
     assert time.sentence.startswith("[vehicle] sd_time_s is 1 s")
+
+
+def test_deviations_of_static_targets_in_millimetres_are_doubted() -> None:
+    usual = Target(Ring("A", 0.9, 0.45, 0.64, 0.13, (0, 43, 78, 180)), (), (1.0, 2.0, 3.0))
+    rough = replace(usual, sd_position_m=(3.0, 3.0, 5.0))
+    assert not [*check_target_deviations([usual, rough])]
+    wrong = replace(usual, sd_position_m=(10.0, 10.0, 20.0))
+    (doubt,) = check_target_deviations([usual, wrong, wrong])
+    assert doubt.sentence.startswith("sd_position_m of A is 20 m, and that of 1 other target")
+    assert (doubt.code, doubt.remedy) == (Cause.STANDARD_DEVIATIONS, "give it in m, not in mm")

@@ -79,5 +79,6 @@ def check_times(path: Path, time_s: FloatArray, place: Callable[[int], str]) -> 
         problem = "repeats" if time_s[row] == time_s[row - 1] else "lies before"
         raise KgcpError(
             f"{path}, {place(row)}: the time {problem} that of {place(row - 1)}, by"
-            f" {time_s[row - 1] - time_s[row]:g} s; sort the epochs and keep one of each"
+            f" {time_s[row - 1] - time_s[row]:g} s; sort the epochs and keep one of each, or make a"
+            " flight folder of each vehicle if they are of several"
         )
