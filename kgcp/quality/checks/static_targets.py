@@ -221,8 +221,9 @@ def _place_doubt(wrong: Mapping[str, FloatArray], targets: int) -> Doubt:
                 Cause.STATIC_TARGETS,
                 f"static targets: by the reference poses, all {targets} lie alike"
                 f" {_enu_text(usual_m)} from position_m",
-                "give position_m, reference poses and crs in one datum, with heights of one kind:"
-                " ellipsoidal or above the geoid",
+                "give position_m, reference poses and crs in one datum, with heights of one kind,"
+                " ellipsoidal or above the geoid; if the offset is along the view, check diameters"
+                " and focal length",
                 figures,
             )
     others = f"; {len(wrong)} of {targets} targets do not fit" if len(wrong) > 1 else ""
@@ -230,8 +231,8 @@ def _place_doubt(wrong: Mapping[str, FloatArray], targets: int) -> Doubt:
         Cause.STATIC_TARGETS,
         f"static targets: by the reference poses, {names[0]} lies {_enu_text(wrong[names[0]])} from"
         f" its position_m{others}",
-        "check position_m, the names, the reference poses, and whether a target was moved; 'kgcp"
-        " place' shows all",
+        "check position_m, the diameter, the names, the reference poses, and whether a target was"
+        " moved; 'kgcp place' shows all",
         figures,
     )
 
