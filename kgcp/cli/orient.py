@@ -176,7 +176,7 @@ def _report(poses: FlightPoses) -> None:
         if len(frames) > _MAX_NAMED:
             measured = sum(name in each.targets for each in oriented)
             where = f"{len(frames)} of {measured} frames, first in {frames[0]}"
-            where += "; check its position_m" if 2 * len(frames) > measured else ""
+            where += "; check its position_m and diameter" if 2 * len(frames) > measured else ""
         click.echo(f"kgcp: doubt: {name} left out in {where}", err=True)
     for doubt in poses.doubts:
         click.echo(f"kgcp: doubt: {doubt}", err=True)

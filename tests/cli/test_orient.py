@@ -164,6 +164,26 @@ def test_positions_without_stated_accuracy_are_named(tmp_path: Path) -> None:
     assert doubt in result.stderr
 
 
+def test_a_target_with_another_diameter_than_stated_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Flat ground from above, far away: the pose depends on the distances."""
+    monkeypatch.setattr("tests.ground_flight.OUTLINE_PX", 0.02)
+    offsets_m = np.array([[-1.8, 1.8, 0.0], [1.8, 0.6, 0.0], [0.0, -2.8, 0.0], [-2.6, -1.6, 0.0]])
+    flight, rng = GroundFlight(offsets_m=offsets_m, frames=6), np.random.default_rng(1)
+    for frame in range(flight.frames):
+        flight.centres[frame] = [*rng.uniform(-1.0, 1.0, 2), 60.0]
+        z = np.append(rng.uniform(-0.15, 0.15, 2), -1.0)
+        z /= np.linalg.norm(z)
+        x = np.cross(z, [0.0, 1.0, 0.2])
+        x /= np.linalg.norm(x)
+        flight.rotations[frame] = np.column_stack((x, np.cross(z, x), z))
+        flight.wrong[frame, "D"] = -0.05 * flight.pose(frame, 3).translation_m
+    result = run("orient", flight.write(tmp_path / "flight", sd_position_m=0.002))
+    assert "1 the distance of D contradicts the others; look at the diameter" in result.stderr
+    assert "D left out in " in result.stderr
+
+
 def test_a_failure_to_orient_most_frames_is_reported(tmp_path: Path) -> None:
     exchanged = {
         (frame, name): other for frame in range(8) for name, other in (("A", "B"), ("B", "A"))

@@ -259,7 +259,7 @@ def _by_points(
     try:
         resection = resected(images)
     except NoPoseError as error:
-        reason = _scale_reason(images, resected) or str(error)
+        reason = _scale_reason(names, images, resected) or str(error)
         return FramePose(frame, names, None, None, (), reason)
     if abs(resection.distance_scale) > _MAX_SCALE_SIGMAS * images.sd_scale:
         return FramePose(frame, names, None, None, (), _scale_words(resection.distance_scale))
@@ -270,10 +270,13 @@ def _by_points(
     return _of_resection(frame, names, resection, sd_focal, images, camera, sd_focal_before)
 
 
-def _scale_reason(images: PointImages, resected: Callable[[PointImages], Resection]) -> str:
-    """Return the reason that all distances have a wrong scale, or an empty string.
+def _scale_reason(
+    names: Sequence[str], images: PointImages, resected: Callable[[PointImages], Resection]
+) -> str:
+    """Return the reason that distances have a wrong scale, or an empty string.
 
-    It applies if a pose without the distances exists, and they differ from it by a common factor.
+    It applies if a pose without the distances exists, and they differ from it by a common factor,
+    or less than half of them differ from it while the others agree.
     """
     unknown = np.full(len(images), np.nan)
     with contextlib.suppress(NoPoseError):
@@ -285,6 +288,10 @@ def _scale_reason(images: PointImages, resected: Callable[[PointImages], Resecti
         scale, limit = float(np.nanmedian(logs)), _MAX_SCALE_SIGMAS * images.sd_scale
         if abs(scale) > limit > np.nanmedian(np.abs(logs - scale)):
             return _scale_words(scale)
+        is_wrong = np.abs(logs) > limit
+        if abs(scale) < limit and is_wrong.any():
+            wrong = ", ".join(name for name, off in zip(names, is_wrong, strict=True) if off)
+            return f"the distance of {wrong} contradicts the others; look at the diameter"
     return ""
 
 
