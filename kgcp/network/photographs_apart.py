@@ -13,22 +13,22 @@ from itertools import combinations
 import numpy as np
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
-from kgcp.network.calibration_records import operator_sd_px, rms_px
+from kgcp.network.calibration_records import comparable_residuals, misfit_px, operator_sd_px
 from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem
 
-# An RMS below this multiple of the stated standard deviation of the discs leaves nothing to
+# A misfit below this multiple of the stated standard deviation of the discs leaves nothing to
 # explain: all photographs fit.
 _FITTING_RATIO = 1.5
 # At most this share of the photographs may stand apart, and at least this many must remain.
 _MAX_SHARE = 0.25
 _MIN_REMAINING = 4
 _TRIED = 4  # photographs with the largest residuals, of which one is left out in each round
-_MIN_GAIN = 2.0  # ratio of the RMS before and after
+_MIN_GAIN = 2.0  # ratio of the misfits before and after
 # With 6 to 8 photographs, pairs are tried as well, with a larger gain required. If two of six have
 # another zoom, leaving out one after the other starts with a wrong one.
 _PAIRS_AMONG, _MIN_PAIR_GAIN = (6, 8), 5.0
-# Of the numbers of photographs left out, the smallest counts whose RMS is at most this multiple of
-# the least RMS.
+# Of the numbers of photographs left out, the smallest counts whose misfit is at most this multiple
+# of the least one.
 _NEARLY_LEAST_RATIO = 1.5
 _USUAL_TERMS = ("k1", "k2")  # photographs that stand apart may have made them insignificant
 
@@ -44,7 +44,7 @@ def photographs_apart(problem: CalibrationProblem, state: AdjustedNetwork) -> tu
     """
     limit_px = _FITTING_RATIO * operator_sd_px(problem.views)
     most = min(int(_MAX_SHARE * len(problem.views)), len(problem.views) - _MIN_REMAINING)
-    first_px = rms_px(state.solution)
+    first_px = misfit_px(problem.views, state.solution)
     if most < 1 or first_px <= limit_px:
         return ()
     terms = (*_USUAL_TERMS, *(t for t in state.unknowns.terms if t not in _USUAL_TERMS))
@@ -54,9 +54,9 @@ def photographs_apart(problem: CalibrationProblem, state: AdjustedNetwork) -> tu
     while len(left_out) < most and misfits_px[-1] > limit_px:
         # the photograph that falsifies the camera need not have the largest residuals
         index = np.arange(len(problem.views))
-        tried = np.argsort(-_view_rms_px(state))[:_TRIED].tolist()
+        tried = np.argsort(-_view_misfits_px(problem, state))[:_TRIED].tolist()
         trials = [without(problem, state, index == view) for view in tried]
-        misfits = [rms_px(trial.solution) for _, trial in trials]
+        misfits = [misfit_px(trial.views, adjusted.solution) for trial, adjusted in trials]
         best = int(np.argmin(misfits))
         left_out.append(problem.views[tried[best]].photo)
         problem, state = trials[best]
@@ -76,12 +76,12 @@ def _pair_apart(
     if not least <= len(problem.views) <= most:
         return ()
     index = np.arange(len(problem.views))
-    misfits_px = {
-        pair: rms_px(without(problem, state, np.isin(index, pair))[1].solution)
-        for pair in combinations(index.tolist(), 2)
-    }
+    misfits_px = {}
+    for pair in combinations(index.tolist(), 2):
+        others, adjusted = without(problem, state, np.isin(index, pair))
+        misfits_px[pair] = misfit_px(others.views, adjusted.solution)
     best = min(misfits_px, key=misfits_px.__getitem__)
-    is_gain = _MIN_PAIR_GAIN * misfits_px[best] <= rms_px(state.solution)
+    is_gain = _MIN_PAIR_GAIN * misfits_px[best] <= misfit_px(problem.views, state.solution)
     if not is_gain or misfits_px[best] > limit_px:
         return ()
     return tuple(problem.views[view].photo for view in best)
@@ -97,11 +97,12 @@ def without(
     return problem, problem.with_estimate(state, state.estimate.part(is_kept))
 
 
-def _view_rms_px(state: AdjustedNetwork) -> FloatArray:
-    """Return the RMS of each photograph's residuals (v,) over kept discs; infinite without any."""
+def _view_misfits_px(problem: CalibrationProblem, state: AdjustedNetwork) -> FloatArray:
+    """Return each photograph's RMS (v,) of comparable residuals; infinite without kept discs."""
     count = len(state.estimate.rotations)
     view = state.network.observations.view[state.solution.is_used]
-    squares = np.sum(state.solution.residuals[state.solution.is_used] ** 2, axis=1)
+    residuals = comparable_residuals(problem.views, state.solution)[state.solution.is_used]
+    squares = np.sum(residuals**2, axis=1)
     discs = np.bincount(view, minlength=count)
     mean = np.bincount(view, squares, count) / np.maximum(discs, 1)
     return np.asarray(np.sqrt(np.where(discs > 0, mean, np.inf)))

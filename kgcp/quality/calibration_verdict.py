@@ -25,7 +25,7 @@ _ADVISED_PLACES = 12
 _MIN_DISCS = 6  # per photograph
 _MAX_REJECTED_SHARE = 0.1
 _MAX_FOCAL_SD = 0.01  # relative
-_MAX_OPERATOR_RATIO = 3.0  # of an RMS to the standard deviation with which discs are measured
+_MAX_OPERATOR_RATIO = 3.0  # of a misfit to the standard deviation with which discs are measured
 _MAX_FIELD_RATIO = 2.0  # of the discs' deviations from the field to what it states
 _MAX_BAR_SDS = 3.0  # of a bar's residual
 _MIN_COVERAGE = 0.7
@@ -88,6 +88,7 @@ class CalibrationNumbers:
     discs_used: int
     rms_fixed_px: float  # with the field as stated
     rms_px: float
+    misfit_px: float  # the same, discs that are measured worse than most counting less
     operator_sd_px: float  # with which discs are measured
     sd: FloatArray  # (12,): of `CALIBRATION_PARAMETERS`
     coverage: float  # share of the frame's cells that have a disc
@@ -152,6 +153,7 @@ def calibration_numbers(
         int(np.count_nonzero(calibration.solution.is_used)),
         calibration.rms_fixed_px,
         calibration.rms_px,
+        calibration.misfit_px,
         calibration.operator_sd_px,
         np.sqrt(calibration.covariance.cov.diagonal()),
         len({(x, y) for x, y in cells.tolist()}) / (_CELLS[0] * _CELLS[1]),
@@ -256,7 +258,7 @@ def _unusable(calibration: CameraCalibration, numbers: CalibrationNumbers) -> It
     if {"cx", "cy"} & set(calibration.undetermined):
         yield "the principal point is not determined"
     far_off_px = 10.0 * _MAX_OPERATOR_RATIO * numbers.operator_sd_px
-    if numbers.field_of_view_deg > _FISHEYE_DEG and numbers.rms_px > far_off_px:
+    if numbers.field_of_view_deg > _FISHEYE_DEG and numbers.misfit_px > far_off_px:
         yield "the lens looks like a fisheye, which kgcp's camera model does not describe"
 
 
@@ -271,9 +273,9 @@ def _more_photographs(numbers: CalibrationNumbers) -> str:
 
 def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iterator[str]:
     if _fits_badly(numbers):
-        ratio = numbers.rms_px / numbers.operator_sd_px
+        ratio = numbers.misfit_px / numbers.operator_sd_px
         yield (
-            f"discs fit {ratio:.1f} times worse ({numbers.rms_px:.3f} px) than they are measured"
+            f"discs fit {ratio:.1f} times worse ({numbers.misfit_px:.3f} px) than they are measured"
         )
     yield from _field_doubts(numbers)
     yield from _bar_doubts(calibration)
@@ -352,7 +354,7 @@ def _bar_doubts(calibration: CameraCalibration) -> Iterator[str]:
 
 
 def _fits_badly(numbers: CalibrationNumbers) -> bool:
-    return numbers.rms_px > _MAX_OPERATOR_RATIO * numbers.operator_sd_px
+    return numbers.misfit_px > _MAX_OPERATOR_RATIO * numbers.operator_sd_px
 
 
 def _bends_much(numbers: CalibrationNumbers) -> bool:

@@ -27,7 +27,7 @@ from kgcp.network.calibration_records import (
 )
 from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem
 from kgcp.network.frame_camera import FrameCameraModel
-from kgcp.network.photographs_apart import _view_rms_px
+from kgcp.network.photographs_apart import _view_misfits_px
 from kgcp.network.records import CalibrationPrior
 from kgcp.network.sheet_bends import bend_shapes
 from kgcp.quality.calibration_verdict import (
@@ -336,9 +336,38 @@ def test_a_photograph_without_any_kept_disc_is_the_worst() -> None:
         solution=replace(result.solution, is_used=used),
         estimate=result.solution.estimate,
     )
-    rms_px = _view_rms_px(cast("AdjustedNetwork", state))
-    assert np.argmax(rms_px) == 5
-    assert np.all((rms_px[:5] > 0.003) & (rms_px[:5] < 0.03))
+    problem = SimpleNamespace(views=result.views)
+    misfits_px = _view_misfits_px(
+        cast("CalibrationProblem", problem), cast("AdjustedNetwork", state)
+    )
+    assert np.argmax(misfits_px) == 5
+    assert np.all((misfits_px[:5] > 0.003) & (misfits_px[:5] < 0.03))
+
+
+def partly_covered(view: NamedView, discs: tuple[int, ...]) -> NamedView:
+    """Return a photograph of which some discs are measured 40 times worse, and state it."""
+    vectors, covs = view.vectors.copy(), view.covs.copy()
+    for disc, sign in zip(discs, (1.0, -1.0, 1.0), strict=False):
+        vectors[disc, :2] += sign * 40.0 * SD_PX
+        covs[disc, :2, :2] *= 40.0**2
+    return replace(view, vectors=vectors, covs=covs)
+
+
+def test_discs_that_state_how_badly_they_are_measured_cast_no_doubt() -> None:
+    """Fingers cover a part of some discs, whose residuals are as large as stated."""
+    made = [partly_covered(view, (3, 11, 22)) for view in views()]
+    result = calibrated(made)
+    assert result.dropped == ()
+    assert result.rms_px > 3.0 * result.operator_sd_px
+    assert result.misfit_px < 1.2 * result.operator_sd_px
+    assert judge(result, calibration_numbers(result)).grade is CalibrationGrade.GOOD
+
+
+def test_a_photograph_with_a_badly_measured_disc_takes_part() -> None:
+    made = nine_views()
+    made[4] = partly_covered(made[4], (3, 11))
+    result = calibrated(made, PointModel.STIFF, LensModel.AUTO)
+    assert result.dropped == ()
 
 
 def test_photographs_whose_files_are_turned_by_half_a_turn_take_no_part() -> None:

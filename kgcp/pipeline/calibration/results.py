@@ -197,6 +197,7 @@ def _summary(
         "discs_used": numbers.discs_used,
         "rms_fixed_px": numbers.rms_fixed_px,
         "rms_px": numbers.rms_px,
+        "misfit_px": numbers.misfit_px,
         "operator_sd_px": numbers.operator_sd_px,
         "variance_factor": calibration.precision.variance_factor,
         "points": calibration.points_used.value,

@@ -121,8 +121,9 @@ def fit_words(calibration: CameraCalibration) -> str:
     remarks = [f"{', '.join(names)} {remark}" for names, remark in weak if names]
     determined = "; ".join(remarks) or "all parameters are determined"
     return (
-        f"The RMS of the residuals is {calibration.rms_px:.3f} px, the standard deviation of a"
-        f" measured disc {calibration.operator_sd_px:.3f} px; {determined}."
+        f"The RMS of the residuals is {calibration.rms_px:.3f} px"
+        f" ({calibration.misfit_px:.3f} px if discs that are measured worse than most count less), the"
+        f" standard deviation of a measured disc {calibration.operator_sd_px:.3f} px; {determined}."
     )
 
 
