@@ -13,7 +13,7 @@ photographs. Residuals are first divided by a power of their redundancy:
 - Power 1 is CR3, the jackknife. The ratio is 0.3 to 0.5 with three to five photographs, one of
   which dominates.
 
-The power used here, `_REDUNDANCY_POWER`, lies between the two.
+The power used here, `REDUNDANCY_POWER`, lies between the two.
 
 Two corrections follow. Even with independent errors, the residuals so divided scatter more than the
 parameters, by a known amount. And with few photographs, their scatter varies by chance. So only the
@@ -56,7 +56,7 @@ from kgcp.network.point_elimination import (
 )
 from kgcp.network.records import Network, Precision, Solution
 
-_REDUNDANCY_POWER = 0.75
+REDUNDANCY_POWER = 0.75
 # Smallest factor of the stated variances. Residuals of zero do not prove that the discs are exact.
 _MIN_FACTOR = 1e-4
 # Smallest redundancy of a direction in the space of the observations. Below, no other observation
@@ -207,7 +207,7 @@ def _redundancy_numbers(
     """Return the redundancy numbers (n,) of the discs, summed over both coordinates: 0…2."""
     redundancy = np.zeros(count)
     for view, normal in zip(equations, system.pose_normals, strict=True):
-        projected, _ = _without_pose(view)
+        projected, _ = without_pose(view)
         own = np.einsum("ij,jk,ik->i", view.by_pose, np.linalg.inv(normal), view.by_pose)
         shared = inverse[np.ix_(view.columns, view.columns)]
         projected = projected[: len(own)]
@@ -271,7 +271,7 @@ def _joined(views: Sequence[ViewRows]) -> tuple[FloatArray, FloatArray, IndexArr
 
     Poses are eliminated; n is the number of rows of all its photographs.
     """
-    parts = [_without_pose(view) for view in views]
+    parts = [without_pose(view) for view in views]
     residuals = np.concatenate([part for _, part in parts])
     columns = dict.fromkeys(np.concatenate([view.columns for view in views]).tolist())
     index = {column: number for number, column in enumerate(columns)}
@@ -315,14 +315,14 @@ def _pull(
         carried, squares = carried @ projected.T @ vectors, np.ones_like(values)
     is_checked = 1.0 - values > _MIN_REDUNDANCY
     carried, redundancy = carried[:, is_checked], 1.0 - values[is_checked]
-    expected = factor * squares[is_checked] * redundancy ** (1.0 - 2.0 * _REDUNDANCY_POWER)
+    expected = factor * squares[is_checked] * redundancy ** (1.0 - 2.0 * REDUNDANCY_POWER)
     return (
-        carried @ (along[is_checked] / redundancy**_REDUNDANCY_POWER),
+        carried @ (along[is_checked] / redundancy**REDUNDANCY_POWER),
         (carried * expected) @ carried.T,
     )
 
 
-def _without_pose(view: ViewRows) -> tuple[FloatArray, FloatArray]:
+def without_pose(view: ViewRows) -> tuple[FloatArray, FloatArray]:
     """Return derivatives (2m + b, k) and residuals (2m + b,) with pose and bends eliminated.
 
     The last b rows are those of the bends' prior.

@@ -13,6 +13,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import rotation_onto
 from kgcp.network.calibration_records import CameraCalibration, LensModel, PointModel
 from kgcp.network.equations import view_rows, whitened
+from kgcp.network.focal_trend import FocalTrend, focal_trend
 from kgcp.network.records import PointPrior
 from kgcp.network.sheet_bends import bend_displacements
 from kgcp.quality.disc_light import DiscLight
@@ -30,6 +31,8 @@ _MAX_FIELD_RATIO = 2.0  # of the discs' deviations from the field to what it sta
 _MAX_BAR_SDS = 3.0  # of a bar's residual
 _MIN_COVERAGE = 0.7
 _MIN_NORMALS_DEG = 15.0  # largest angle between two normals of the field
+_TREND_LEVEL = 0.001  # probability below which a focal length changes with the distance
+_MIN_TREND = 0.0005  # smallest such change, relative to the focal length
 _MAX_RADIUS_ERROR = 0.03  # relative, of the stated diameters
 # Relative difference of the discs' size in one photograph from that in most, above which it shows
 # another field. Sharpened discs in motion, of 4 px radius, differ by up to 5.5 % (data set ros10).
@@ -101,6 +104,7 @@ class CalibrationNumbers:
     flatness_m: float | None  # RMS of the field's heights; None: taken as stated
     field: FieldDeviation | None  # None: taken as stated
     bending: FieldBending | None  # None: no bending was estimated
+    trend: FocalTrend | None  # None: the photographs cannot tell
     light: DiscLight | None  # None: levels are not known
 
     @property
@@ -167,6 +171,7 @@ def calibration_numbers(
         else float(np.sqrt(np.mean((heights - heights.mean()) ** 2))),
         _field_deviation(calibration),
         _field_bending(calibration),
+        focal_trend(calibration.network, calibration.solution, calibration.precision),
         light,
     )
 
@@ -277,6 +282,7 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
         yield (
             f"discs fit {ratio:.1f} times worse ({numbers.misfit_px:.3f} px) than they are measured"
         )
+    yield from _focus_doubts(calibration, numbers)
     yield from _field_doubts(numbers)
     yield from _bar_doubts(calibration)
     if never := discs_that_never_fit(calibration):
@@ -308,6 +314,16 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
         )
     if numbers.light is not None and numbers.light.doubt:
         yield numbers.light.doubt
+
+
+def _focus_doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iterator[str]:
+    if numbers.trend is not None and _is_focus_changing(calibration, numbers):
+        change_px = numbers.trend.change_px
+        yield (
+            "the focal length changes with the distance: in the nearest photograph it is"
+            f" {abs(change_px):.1f} px {'longer' if change_px > 0.0 else 'shorter'} than in the"
+            " farthest"
+        )
 
 
 def _field_doubts(numbers: CalibrationNumbers) -> Iterator[str]:
@@ -357,6 +373,14 @@ def _fits_badly(numbers: CalibrationNumbers) -> bool:
     return numbers.misfit_px > _MAX_OPERATOR_RATIO * numbers.operator_sd_px
 
 
+def _is_focus_changing(calibration: CameraCalibration, numbers: CalibrationNumbers) -> bool:
+    """Tell whether the focal length changes with the distance, as by autofocus."""
+    if numbers.trend is None:
+        return False
+    least_px = _MIN_TREND * calibration.camera.fx
+    return abs(numbers.trend.change_px) > least_px and numbers.trend.p_value < _TREND_LEVEL
+
+
 def _bends_much(numbers: CalibrationNumbers) -> bool:
     """Tell whether the field's bending displaces discs by more than measuring errors."""
     if numbers.bending is None:
@@ -397,6 +421,11 @@ def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
             "Keep zoom, focus and crop the same in all photographs, rotate none of them afterwards,"
             " and keep the field rigid. If only photographs that do not fit reach the corners, the"
             " lens may be one that kgcp's models do not describe."
+        )
+    if _is_focus_changing(calibration, numbers):
+        yield (
+            "Switch the autofocus off, and focus as in the flight: with another focus, the focal"
+            " length is another."
         )
     if numbers.places < _ADVISED_PLACES:
         yield _more_photographs(numbers)

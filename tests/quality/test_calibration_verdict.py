@@ -304,6 +304,47 @@ def test_a_photograph_of_another_zoom_takes_no_part(zoom: float, lens: LensModel
     assert any("Keep zoom, focus and crop" in sentence for sentence in verdict.advice)
 
 
+def from_two_distances(lens_m: float, noise_px: float = SD_PX) -> list[NamedView]:
+    """Twelve photographs by a lens that is focused on the field; zero: its focus is fixed."""
+    made = []
+    for distance_m in (0.3, 0.4):
+        focal_px = 1500.0 * (1.0 + lens_m / distance_m)
+        camera = replace(CAMERA, fx=focal_px, fy=focal_px)
+        those = views(camera=camera, distance_m=distance_m, noise_px=noise_px)
+        made += [replace(view, photo=f"{view.photo} {distance_m}") for view in those]
+    return made
+
+
+def test_a_focal_length_that_changes_with_the_distance_is_reported() -> None:
+    """Poses absorb the change so well that the discs fit: nothing else shows it."""
+    result = calibrated(from_two_distances(0.004), PointModel.STIFF, LensModel.AUTO)
+    numbers = calibration_numbers(result)
+    assert numbers.misfit_px < 3.0 * numbers.operator_sd_px
+    assert numbers.trend is not None
+    assert numbers.trend.lens_m == pytest.approx(0.004, rel=0.25)
+    assert numbers.trend.change_px == pytest.approx(5.0, rel=0.25)
+    verdict = judge(result, numbers)
+    assert verdict.grade is CalibrationGrade.LOOK
+    assert "changes with the distance: in the nearest photograph it is" in verdict.sentence
+    assert any("Switch the autofocus off" in sentence for sentence in verdict.advice)
+
+
+@pytest.mark.parametrize("points", [PointModel.FIXED, PointModel.STIFF])
+def test_a_fixed_focal_length_is_not_said_to_change(points: PointModel) -> None:
+    for made in (from_two_distances(0.0), from_two_distances(0.0, noise_px=4.0 * SD_PX)):
+        result = calibrated(made, points, LensModel.AUTO)
+        numbers = calibration_numbers(result)
+        assert numbers.trend is not None
+        assert numbers.trend.p_value > 0.001
+        assert abs(numbers.trend.lens_m) < 0.002
+        assert "changes with the distance" not in judge(result, numbers).sentence
+
+
+def test_photographs_from_few_places_tell_no_change_of_the_focal_length() -> None:
+    result = calibrated(views()[:4])
+    assert calibration_numbers(result).trend is None
+
+
 def test_a_photograph_of_another_zoom_is_found_if_another_one_fits_worst() -> None:
     """Its pose and the camera take up so much that a right one has the largest residuals."""
     made = views(distance_m=0.45)

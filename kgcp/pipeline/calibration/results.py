@@ -211,6 +211,8 @@ def _summary(
                 calibration.field.bars, calibration.bar_residuals_m, strict=True
             )
         ],
+        "focal_change_px": None if numbers.trend is None else numbers.trend.change_px,
+        "focal_change_p": None if numbers.trend is None else numbers.trend.p_value,
         "bending_m": None if numbers.bending is None else numbers.bending.height_m,
         "bending_px": None if numbers.bending is None else numbers.bending.image_px,
         "change_if_eccentricity_neglected": change_if_neglected(calibration),

@@ -122,7 +122,7 @@ def fit_words(calibration: CameraCalibration) -> str:
     determined = "; ".join(remarks) or "all parameters are determined"
     return (
         f"The RMS of the residuals is {calibration.rms_px:.3f} px"
-        f" ({calibration.misfit_px:.3f} px if discs that are measured worse than most count less), the"
+        f" ({calibration.misfit_px:.3f} px if discs measured worse than most count less), the"
         f" standard deviation of a measured disc {calibration.operator_sd_px:.3f} px; {determined}."
     )
 

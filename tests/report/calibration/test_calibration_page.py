@@ -97,8 +97,8 @@ def test_a_good_fit_is_reported_with_what_it_does_not_determine(
 ) -> None:
     words = fit_words(calibration)
     assert re.fullmatch(
-        r"The RMS of the residuals is 0\.01\d px \(0\.01\d px if discs that are measured worse than"
-        r" most count less\), the standard deviation of a measured disc"
+        r"The RMS of the residuals is 0\.01\d px \(0\.01\d px if discs measured worse than most"
+        r" count less\), the standard deviation of a measured disc"
         r" 0\.014 px; all parameters are determined\.",
         words,
     )
