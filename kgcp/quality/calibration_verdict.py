@@ -16,6 +16,7 @@ from kgcp.network.equations import view_rows, whitened
 from kgcp.network.focal_trend import FocalTrend, focal_trend
 from kgcp.network.records import PointPrior
 from kgcp.network.sheet_bends import bend_displacements
+from kgcp.network.turned_files import turned_photographs
 from kgcp.quality.disc_light import DiscLight
 from kgcp.quality.eccentricity import parameters_if_neglected
 from kgcp.quality.frame_rays import ray_deviations_px
@@ -105,6 +106,7 @@ class CalibrationNumbers:
     field: FieldDeviation | None  # None: taken as stated
     bending: FieldBending | None  # None: no bending was estimated
     trend: FocalTrend | None  # None: the photographs cannot tell
+    turned: tuple[str, ...]  # photographs whose files were turned by 180° against most others
     light: DiscLight | None  # None: levels are not known
 
     @property
@@ -172,6 +174,7 @@ def calibration_numbers(
         _field_deviation(calibration),
         _field_bending(calibration),
         focal_trend(calibration.network, calibration.solution, calibration.precision),
+        turned_photographs(calibration),
         light,
     )
 
@@ -282,7 +285,7 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
         yield (
             f"discs fit {ratio:.1f} times worse ({numbers.misfit_px:.3f} px) than they are measured"
         )
-    yield from _focus_doubts(calibration, numbers)
+    yield from _handling_doubts(calibration, numbers)
     yield from _field_doubts(numbers)
     yield from _bar_doubts(calibration)
     if never := discs_that_never_fit(calibration):
@@ -316,7 +319,13 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
         yield numbers.light.doubt
 
 
-def _focus_doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iterator[str]:
+def _handling_doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iterator[str]:
+    """Yield what was changed between photographs, or in their files."""
+    if numbers.turned:
+        yield (
+            f"{_listed(numbers.turned)} would fit the others much better if turned by 180°: the"
+            " principal point is wrong"
+        )
     if numbers.trend is not None and _is_focus_changing(calibration, numbers):
         change_px = numbers.trend.change_px
         yield (
@@ -422,11 +431,7 @@ def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
             " and keep the field rigid. If only photographs that do not fit reach the corners, the"
             " lens may be one that kgcp's models do not describe."
         )
-    if _is_focus_changing(calibration, numbers):
-        yield (
-            "Switch the autofocus off, and focus as in the flight: with another focus, the focal"
-            " length is another."
-        )
+    yield from _handling_advice(calibration, numbers)
     if numbers.places < _ADVISED_PLACES:
         yield _more_photographs(numbers)
     if calibration.undetermined:
@@ -435,6 +440,19 @@ def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
     yield from _field_advice(calibration, numbers)
     if numbers.light is not None and numbers.light.doubt:
         yield "Give photographs as the camera took them, not negatives, and without burnt white."
+
+
+def _handling_advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iterator[str]:
+    if numbers.turned:
+        yield (
+            "Give all photographs as the camera stored them: programs that apply the orientation of"
+            " EXIF turn some."
+        )
+    if _is_focus_changing(calibration, numbers):
+        yield (
+            "Switch the autofocus off, and focus as in the flight: with another focus, the focal"
+            " length is another."
+        )
 
 
 def _is_aspect_untried(calibration: CameraCalibration) -> bool:

@@ -421,6 +421,28 @@ def test_photographs_whose_files_are_turned_by_half_a_turn_take_no_part() -> Non
     assert result.rms_px < 2.0 * result.operator_sd_px
 
 
+def test_photographs_that_were_turned_and_fit_nearly_are_named() -> None:
+    """More than a quarter: none is left out, though the principal point is wrong."""
+    made = from_two_distances(0.0, noise_px=0.3 * SD_PX)
+    turned = (1, 4, 7, 10)
+    names = tuple(made[index].photo for index in turned)
+    for index in turned:
+        made[index] = upside_down(made[index])
+    result = calibrated(made, PointModel.STIFF, LensModel.AUTO)
+    assert result.dropped == ()
+    numbers = calibration_numbers(result)
+    assert numbers.turned == names
+    verdict = judge(result, numbers)
+    assert "would fit the others much better if turned by 180°" in verdict.sentence
+    assert any("as the camera stored them" in sentence for sentence in verdict.advice)
+
+
+@pytest.mark.parametrize("points", [PointModel.FIXED, PointModel.FREE])
+def test_photographs_that_were_not_turned_are_not_said_to_be(points: PointModel) -> None:
+    result = calibrated(from_two_distances(0.0), points, LensModel.AUTO)
+    assert calibration_numbers(result).turned == ()
+
+
 def test_with_two_halves_of_two_zooms_none_is_left_out() -> None:
     other = [replace(view, photo=f"{view.photo}b") for view in views(camera=OTHER_ZOOM)]
     result = calibrated(views() + other, PointModel.STIFF)
