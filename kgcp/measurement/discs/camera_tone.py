@@ -23,6 +23,7 @@ from kgcp.measurement.discs.adjust_disc import (
     check_disc_fit,
     is_in_curved_light,
 )
+from kgcp.measurement.discs.compressed_fit import are_coarse, are_compressed, steps_of
 from kgcp.measurement.discs.disc_levels import Row
 from kgcp.measurement.discs.fit_disc import (
     CAMERA_ROWS,
@@ -36,7 +37,6 @@ from kgcp.measurement.discs.fit_disc import (
 )
 from kgcp.measurement.discs.joint_tone import JointFit, adjust_before_compression, adjust_together
 from kgcp.measurement.discs.tone_curve import WAVES
-from kgcp.measurement.image_model.compression import is_compressed_near, quantisation_steps
 from kgcp.measurement.image_model.photometry import Tone
 
 # How many discs of a photograph are learned from: so many that their radii add up to this, and at
@@ -74,19 +74,17 @@ _LINE_PREFERENCE = 0.25
 # A second start for compressed photographs: the S that cameras add for contrast. From the curve of
 # the compressed values alone, steps may end in a curve that is less likely by 14.
 _MORE_CONTRAST = np.array((0.0, -0.4, 0.0))
-# Compression is coarse if JPEG's steps in grey values (median over the nine longest waves) reach
-# this: they are 2 at quality 92 and 4 at 85. Film's curve is then learned wrongly in half of the
-# cases. In light that falls off by 5 % over the radius, centres of dark discs of R 8 px are then
-# off by 0.015 px, 1.5 to 2 stated deviations.
-_COARSE_STEP = 4.0
 # The excess kurtosis of the point spread is tried in steps of 0.2, at most three of them, from 0 (a
 # Gaussian) or from three steps below 0 (out of focus), whichever is likelier.
 _KURTOSIS_STEP, _DEFOCUSED_STEP, _MOST_KURTOSIS_STEPS = 0.2, -3.0, 3
 # A kurtosis is taken if it gains more than this in twice the log-likelihood, times the power of the
-# excess: in photographs as they are, and in compressed ones. Gains over that power: in focus, 65 to
-# 100 discs have up to 3, and in JPEGs with unknown curves up to 126. Blurred to discs of 2 px
-# radius, they have 500 and more with known curves, 600 with film's in three of four cases, and up
-# to 270 in JPEGs; 14 discs with unknown curves have 23 and 30 (`benchmarks.calibrate.operator`).
+# excess: the first by grey values that are not compressed, or by what compression left; the second
+# by compressed grey values, if the curve is stated or the discs are few. Gains over that power: in
+# focus, 65 to 100 discs have up to 3, and by compressed grey values up to 126. Blurred to discs of
+# 2 px radius, they have 500 and more with known curves, and 600 with film's in three of four cases;
+# by compressed grey values up to 270; 14 discs with unknown curves have 23 and 30. By what
+# compression left, discs in focus lose 4 and more, and 50 discs out of focus gain 40 to 400
+# (`benchmarks.calibrate.operator`).
 _SIGNIFICANT_KURTOSIS, _SIGNIFICANT_IN_COMPRESSED = 16.0, 100.0
 _LITTLE_BENT = 0.02  # standard deviation of the waves of a curve that counts as not bent
 # Median of χ² by its degrees of freedom; with none, discs share nothing to contradict each other in
@@ -107,6 +105,17 @@ class CameraTone:
     is_reliable: bool = True  # False: compression has left too little to learn from
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Curves:
+    """Discs adjusted together with all curves that are possible."""
+
+    plain: Sequence[JointFit]
+    bent: Sequence[JointFit]  # none if the curve is stated
+    # The likeliest plain curve, bent, adjusted to what JPEG left; None: not compressed, or too few
+    # discs to tell a curve
+    before_compression: JointFit | None
+
+
 def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) -> CameraTone:
     """Learn the tone for the discs of one photograph, or of all photographs by one camera.
 
@@ -124,36 +133,34 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     tone = Tone.of(response)
     chosen = [task for tasks in photographs for task in _learning_tasks(tasks)]
     fits = _first_fits(chosen, tone)
-    plain, bent = _by_curves(fits, tone)
-    in_focus = _likeliest(bent or plain)
+    steps = steps_of(fits)
+    curves = _by_curves(fits, tone, steps)
     sds = [fit.sd for fit in fits]  # the same for all that is compared
-    kurtosis = 0.0 if in_focus is None else _learned_kurtosis(in_focus, sds)
+    kurtosis = _learned_kurtosis(curves, sds, steps)
     camera = CameraTone(
         tone,
         kurtosis=kurtosis,
         is_curve_unknown=tone is Tone.UNKNOWN,
-        is_compressed=_are_compressed(fits),
+        is_compressed=are_compressed(fits),
     )
     if tone is Tone.LINEAR:
         return camera
     if kurtosis:
         fits = [_with_kurtosis(fit, kurtosis) for fit in fits]
-        plain, bent = _by_curves(fits, tone)
+        curves = _by_curves(fits, tone, steps)
     best = _likeliest(
         [
             _with_best_mask(joint, partial(_adjusted_together, sds=sds))
-            for joint in _worth_comparing(plain, bent)
+            for joint in _worth_comparing(curves.plain, curves.bent)
         ]
     )
     if best is None:
         return replace(camera, sharpening_px=SHARPENING_PX)
-    base = _BENT.get(min(plain, key=lambda joint: joint.loss).tone) if plain else None
-    start = next((joint for joint in bent if joint.tone is base), None)
-    is_reliable = True
-    if start is not None and len(fits) >= _FEWEST_DISCS:  # few tell too little of a curve
-        steps = _steps_of(best.fits)
-        best = _before_compression(best, start, steps)
-        is_reliable = best.is_settled and not _are_coarse(steps)
+    is_reliable, before = True, curves.before_compression
+    if before is not None:
+        if best.tone.is_shaped or _is_bent(before):
+            best = before
+        is_reliable = best.is_settled and not are_coarse(steps)
     blur_px = float(np.median([fit.state.blur.mean_sd_px for fit in best.fits]))
     prior = _prior_by(best)
     if camera.is_curve_unknown and not best.tone.is_shaped and _are_burnt(fits):
@@ -228,14 +235,58 @@ def _first_fits(tasks: Sequence[DiscTask], tone: Tone) -> list[DiscFit]:
     return clean if len(clean) >= min(_FEWEST_DISCS, len(fits) // 2) else fits
 
 
-def _by_curves(fits: Sequence[DiscFit], tone: Tone) -> tuple[list[JointFit], list[JointFit]]:
-    """Return discs adjusted together with each plain curve that is possible, and each bent one."""
+def _by_curves(fits: Sequence[DiscFit], tone: Tone, steps: Sequence[FloatArray | None]) -> _Curves:
+    """Adjust discs together with all curves that are possible.
+
+    Parameters
+    ----------
+    steps : sequence of (8, 8) arrays
+        Of each disc's photograph; None: not compressed.
+    """
     if tone is not Tone.UNKNOWN:
-        return _joints(fits, (tone,)), []
-    return _joints(fits, tuple(_BENT)), _joints(fits, tuple(_BENT.values()))
+        return _Curves(_joints(fits, (tone,)), [], None)
+    plain, bent = _joints(fits, tuple(_BENT)), _joints(fits, tuple(_BENT.values()))
+    before = None
+    if plain and any(each is not None for each in steps) and len(fits) >= _FEWEST_DISCS:
+        # Plain curves differ by 100 and more in log-likelihood; bent curves of small discs are
+        # equally likely by what compression leaves. But a line cannot be bent to film's curve:
+        # centres would be off by 0.006 px.
+        base = _BENT[min(plain, key=lambda joint: joint.loss).tone]
+        start = next((joint for joint in bent if joint.tone is base), None)
+        before = None if start is None else _before_compression(start, steps)
+    return _Curves(plain, bent, before)
 
 
-def _learned_kurtosis(in_focus: JointFit, sds: Sequence[FloatArray]) -> float:
+def _learned_kurtosis(
+    curves: _Curves, sds: Sequence[FloatArray], steps: Sequence[FloatArray | None]
+) -> float:
+    """Return the excess kurtosis of the camera's point spread; 0: none is significant.
+
+    Parameters
+    ----------
+    curves : _Curves
+        Without kurtosis.
+    sds : sequence of (n,) arrays
+        As for `adjust_together`.
+    steps : sequence of (8, 8) arrays
+        As for `_by_curves`.
+    """
+    before, in_focus = curves.before_compression, _likeliest(curves.bent or curves.plain)
+    if before is not None:
+        again = partial(
+            _adjusted_before_compression, steps=steps, sds=[fit.sd for fit in before.fits]
+        )
+        return _likeliest_kurtosis(before, partial(_from_both_starts, again), _SIGNIFICANT_KURTOSIS)
+    if in_focus is None:
+        return 0.0
+    is_compressed = any(each is not None for each in steps)
+    least_gain = _SIGNIFICANT_IN_COMPRESSED if is_compressed else _SIGNIFICANT_KURTOSIS
+    return _likeliest_kurtosis(in_focus, partial(_adjusted_together, sds=sds), least_gain)
+
+
+def _likeliest_kurtosis(
+    in_focus: JointFit, adjusted: Callable[..., JointFit | None], least_gain: float
+) -> float:
     """Return the excess kurtosis of the point spread that makes all discs together likeliest.
 
     It is 0 unless a negative one, that of a camera out of focus, is significantly likelier. A
@@ -246,15 +297,17 @@ def _learned_kurtosis(in_focus: JointFit, sds: Sequence[FloatArray]) -> float:
     ----------
     in_focus : JointFit
         Discs without kurtosis, with the likeliest curve.
-    sds : sequence of (n,) arrays
-        As for `adjust_together`.
+    adjusted : callable
+        Adjusts discs, given fits, states, a curve and the σ of a mask; None if that fails.
+    least_gain : float
+        In twice the log-likelihood, times a power of the excess.
     """
 
     def at(step: float) -> JointFit | None:
         if step > 0.0:
             return None
         changed = [_with_kurtosis(fit, step * _KURTOSIS_STEP) for fit in in_focus.fits]
-        return _adjusted_together(changed, states, in_focus.tone, in_focus.sharpening_px, sds=sds)
+        return adjusted(changed, states, in_focus.tone, in_focus.sharpening_px)
 
     states = [fit.state for fit in in_focus.fits]
     begin, first = 0.0, in_focus
@@ -265,9 +318,7 @@ def _learned_kurtosis(in_focus: JointFit, sds: Sequence[FloatArray]) -> float:
     gain = in_focus.loss - best.loss
     if gain <= 0.0:
         return 0.0
-    is_compressed = any(each is not None for each in _steps_of(best.fits))
-    least = _SIGNIFICANT_IN_COMPRESSED if is_compressed else _SIGNIFICANT_KURTOSIS
-    is_worthy = 2.0 * gain > least * _excess(best) ** _EXCESS_POWER
+    is_worthy = 2.0 * gain > least_gain * _excess(best) ** _EXCESS_POWER
     return (begin + steps) * _KURTOSIS_STEP if is_worthy else 0.0
 
 
@@ -436,63 +487,44 @@ def _likeliest_along(
     return best, tried[best]
 
 
-def _steps_of(fits: Sequence[DiscFit]) -> list[FloatArray | None]:
-    """Return JPEG's quantisation steps of each disc's photograph; None: not compressed."""
-    photos = {id(fit.sample.window.photo): fit.sample.window.photo for fit in fits}
-    steps = {key: quantisation_steps(photo) for key, photo in photos.items()}
-    return [steps[id(fit.sample.window.photo)] for fit in fits]
-
-
-def _are_compressed(fits: Sequence[DiscFit]) -> bool:
-    """Tell whether any photograph is compressed, by the surroundings of one disc of each."""
-    first = {id(fit.sample.window.photo): fit for fit in reversed(fits)}
-    return any(
-        is_compressed_near(fit.sample.window.photo, fit.state.geometry[:2])
-        for fit in first.values()
-    )
-
-
-def _are_coarse(steps: Sequence[FloatArray | None]) -> bool:
-    """Tell whether the median photograph is compressed so much that curves are learned wrongly."""
-    lowest = [0.0 if each is None else float(np.median(each[:3, :3])) for each in steps]
-    return float(np.median(lowest)) >= _COARSE_STEP
-
-
-def _before_compression(
-    joint: JointFit, bent: JointFit, steps: Sequence[FloatArray | None]
-) -> JointFit:
-    """Adjust discs anew to what JPEG left of their coefficients, if the photographs are compressed.
-
-    Compression may have hidden the bend of the curve. A plain curve becomes a bent one if its bends
-    are significant now.
+def _before_compression(bent: JointFit, steps: Sequence[FloatArray | None]) -> JointFit | None:
+    """Adjust discs anew to what JPEG left of their coefficients; None if that fails.
 
     Parameters
     ----------
-    joint : JointFit
-        Discs with the curve that makes the compressed values likeliest.
     bent : JointFit
-        Discs with the likeliest plain curve, bent, and a mask of the usual width. The base is taken
-        from the plain curves, which differ by 100 and more in log-likelihood; bent curves of small
-        discs are equally likely by what compression leaves. A line cannot be bent to film's curve:
-        centres would be off by 0.006 px.
+        Discs with the likeliest plain curve, bent, and a mask of the usual width.
     steps : sequence of (8, 8) arrays
         Of each disc's photograph; None: not compressed.
     """
-    if all(each is None for each in steps):
-        return joint
     adjusted = partial(_adjusted_before_compression, steps=steps)
     states = [fit.state for fit in bent.fits]
     first = adjusted(bent.fits, states, bent.tone, bent.sharpening_px)
     if first is None:
-        return joint
+        return None
     again = partial(adjusted, sds=[fit.sd for fit in first.fits])
-    states = [_with_waves(fit.state, bent.tone, _MORE_CONTRAST) for fit in first.fits]
-    other = again(first.fits, states, bent.tone, bent.sharpening_px)
-    likelier = first if other is None or other.loss >= first.loss else other
-    best = _with_best_mask(likelier, again)
-    if not (joint.tone.is_shaped or _is_bent(best)):
-        return joint
-    return replace(best, is_settled=first.is_settled)
+    states = [fit.state for fit in first.fits]
+    likelier = _from_both_starts(again, first.fits, states, bent.tone, bent.sharpening_px) or first
+    return replace(_with_best_mask(likelier, again), is_settled=first.is_settled)
+
+
+def _from_both_starts(
+    adjusted: Callable[..., JointFit | None],
+    fits: Sequence[DiscFit],
+    states: Sequence[DiscState],
+    tone: Tone,
+    sharpening_px: float,
+) -> JointFit | None:
+    """Return discs adjusted from states, or from the same with more contrast if that is likelier.
+
+    Parameters
+    ----------
+    adjusted : callable
+        Adjusts discs, given fits, states, a curve and the σ of a mask; None if that fails.
+    """
+    contrasting = [_with_waves(state, tone, _MORE_CONTRAST) for state in states]
+    both = [adjusted(fits, each, tone, sharpening_px) for each in (states, contrasting)]
+    return _likeliest([joint for joint in both if joint])
 
 
 def _with_waves(state: DiscState, tone: Tone, waves: FloatArray) -> DiscState:
