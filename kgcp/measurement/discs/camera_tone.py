@@ -75,8 +75,9 @@ _LINE_PREFERENCE = 0.25
 # the compressed values alone, steps may end in a curve that is less likely by 14.
 _MORE_CONTRAST = np.array((0.0, -0.4, 0.0))
 # The excess kurtosis of the point spread is tried in steps of 0.2, at most three of them, from 0 (a
-# Gaussian) or from three steps below 0 (out of focus), whichever is likelier.
-_KURTOSIS_STEP, _DEFOCUSED_STEP, _MOST_KURTOSIS_STEPS = 0.2, -3.0, 3
+# Gaussian) or from three or five steps below 0 (out of focus), whichever is likeliest. With a wrong
+# curve, −0.6 may be no likelier than 0, although −1 is.
+_KURTOSIS_STEP, _DEFOCUSED_STEPS, _MOST_KURTOSIS_STEPS = 0.2, (-3.0, -5.0), 3
 # A kurtosis is taken if it gains more than this in twice the log-likelihood, times the power of the
 # excess: the first by grey values that are not compressed, or by what compression left; the second
 # by compressed grey values, if the curve is stated or the discs are few. Gains over that power: in
@@ -119,8 +120,8 @@ class _Curves:
 def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) -> CameraTone:
     """Learn the tone for the discs of one photograph, or of all photographs by one camera.
 
-    1. A kurtosis is looked for with the likeliest curve. If the camera proves to be out of focus,
-       all curves are compared with that kurtosis.
+    1. A kurtosis is looked for with the likeliest curve, or by what JPEG left. If the camera proves
+       to be out of focus, all curves are compared with that kurtosis.
     2. An unknown curve is sRGB's or a straight line, whichever makes the same pixels of all discs
        together likelier. It is bent only if that makes them significantly likelier still: where
        white is burnt and black is clipped, little of the curve is seen, and its bends would explain
@@ -133,15 +134,18 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     tone = Tone.of(response)
     chosen = [task for tasks in photographs for task in _learning_tasks(tasks)]
     fits = _first_fits(chosen, tone)
-    steps = steps_of(fits)
+    is_compressed = are_compressed(fits)
+    steps: list[FloatArray | None] = [None] * len(fits)
+    if tone is Tone.UNKNOWN and len(fits) >= _FEWEST_DISCS:  # few tell too little of a curve
+        steps = steps_of(fits)
     curves = _by_curves(fits, tone, steps)
     sds = [fit.sd for fit in fits]  # the same for all that is compared
-    kurtosis = _learned_kurtosis(curves, sds, steps)
+    kurtosis = _learned_kurtosis(curves, sds, steps, is_compressed=is_compressed)
     camera = CameraTone(
         tone,
         kurtosis=kurtosis,
         is_curve_unknown=tone is Tone.UNKNOWN,
-        is_compressed=are_compressed(fits),
+        is_compressed=is_compressed,
     )
     if tone is Tone.LINEAR:
         return camera
@@ -241,13 +245,13 @@ def _by_curves(fits: Sequence[DiscFit], tone: Tone, steps: Sequence[FloatArray |
     Parameters
     ----------
     steps : sequence of (8, 8) arrays
-        Of each disc's photograph; None: not compressed.
+        Of each disc's photograph; None: not compressed, or not needed.
     """
     if tone is not Tone.UNKNOWN:
         return _Curves(_joints(fits, (tone,)), [], None)
     plain, bent = _joints(fits, tuple(_BENT)), _joints(fits, tuple(_BENT.values()))
     before = None
-    if plain and any(each is not None for each in steps) and len(fits) >= _FEWEST_DISCS:
+    if plain and any(each is not None for each in steps):
         # Plain curves differ by 100 and more in log-likelihood; bent curves of small discs are
         # equally likely by what compression leaves. But a line cannot be bent to film's curve:
         # centres would be off by 0.006 px.
@@ -258,7 +262,11 @@ def _by_curves(fits: Sequence[DiscFit], tone: Tone, steps: Sequence[FloatArray |
 
 
 def _learned_kurtosis(
-    curves: _Curves, sds: Sequence[FloatArray], steps: Sequence[FloatArray | None]
+    curves: _Curves,
+    sds: Sequence[FloatArray],
+    steps: Sequence[FloatArray | None],
+    *,
+    is_compressed: bool,
 ) -> float:
     """Return the excess kurtosis of the camera's point spread; 0: none is significant.
 
@@ -279,7 +287,6 @@ def _learned_kurtosis(
         return _likeliest_kurtosis(before, partial(_from_both_starts, again), _SIGNIFICANT_KURTOSIS)
     if in_focus is None:
         return 0.0
-    is_compressed = any(each is not None for each in steps)
     least_gain = _SIGNIFICANT_IN_COMPRESSED if is_compressed else _SIGNIFICANT_KURTOSIS
     return _likeliest_kurtosis(in_focus, partial(_adjusted_together, sds=sds), least_gain)
 
@@ -311,9 +318,10 @@ def _likeliest_kurtosis(
 
     states = [fit.state for fit in in_focus.fits]
     begin, first = 0.0, in_focus
-    defocused = at(_DEFOCUSED_STEP)  # a wrong curve may hide it near 0
-    if defocused is not None and defocused.loss < in_focus.loss:
-        begin, first = _DEFOCUSED_STEP, defocused
+    for step in _DEFOCUSED_STEPS:
+        defocused = at(step)
+        if defocused is not None and defocused.loss < first.loss:
+            begin, first = step, defocused
     steps, best = _likeliest_along(lambda steps: at(begin + steps), first, _MOST_KURTOSIS_STEPS)
     gain = in_focus.loss - best.loss
     if gain <= 0.0:
