@@ -76,8 +76,9 @@ _LINE_PREFERENCE = 0.25
 _MORE_CONTRAST = np.array((0.0, -0.4, 0.0))
 # The excess kurtosis of the point spread is tried in steps of 0.2, at most three of them, from 0 (a
 # Gaussian) or from three or five steps below 0 (out of focus), whichever is likeliest. With a wrong
-# curve, −0.6 may be no likelier than 0, although −1 is.
+# curve, −0.6 may be no likelier than 0, although −1 is. The least is −1.2 (uniform).
 _KURTOSIS_STEP, _DEFOCUSED_STEPS, _MOST_KURTOSIS_STEPS = 0.2, (-3.0, -5.0), 3
+_LEAST_STEP = -6.0
 # A kurtosis is taken if it gains more than this in twice the log-likelihood, times the power of the
 # excess: the first by grey values that are not compressed, or by what compression left; the second
 # by compressed grey values, if the curve is stated or the discs are few. Gains over that power: in
@@ -311,7 +312,7 @@ def _likeliest_kurtosis(
     """
 
     def at(step: float) -> JointFit | None:
-        if step > 0.0:
+        if not _LEAST_STEP <= step <= 0.0:
             return None
         changed = [_with_kurtosis(fit, step * _KURTOSIS_STEP) for fit in in_focus.fits]
         return adjusted(changed, states, in_focus.tone, in_focus.sharpening_px)
