@@ -85,8 +85,8 @@ _LEAST_STEP = -6.0
 # focus, 65 to 100 discs have up to 3, and by compressed grey values up to 126. Blurred to discs of
 # 2 px radius, they have 500 and more with known curves, and 600 with film's in three of four cases;
 # by compressed grey values up to 270; 14 discs with unknown curves have 23 and 30. By what
-# compression left, discs in focus lose 4 and more, and 50 discs out of focus gain 40 to 400
-# (`benchmarks.calibrate.operator`).
+# compression left, discs in focus lose 8 and more, and 45 discs of R 15 px out of focus gain 220 to
+# 410 (`benchmarks.calibrate.operator`).
 _SIGNIFICANT_KURTOSIS, _SIGNIFICANT_IN_COMPRESSED = 16.0, 100.0
 _LITTLE_BENT = 0.02  # standard deviation of the waves of a curve that counts as not bent
 # Median of χ² by its degrees of freedom; with none, discs share nothing to contradict each other in
