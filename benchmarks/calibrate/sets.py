@@ -253,8 +253,9 @@ def halves_z(whole: CameraCalibration, count: int) -> dict[str, float]:
     The parameters are those of the whole set, so that both halves estimate the same ones.
     """
     names = whole.network.model.names
-    terms = tuple(name for name in names if name[0] in "kp")
-    unknowns = NetworkUnknowns(whole.points_used, terms, is_same_aspect="fy" not in names)
+    small = whole.insignificant
+    terms = tuple(name for name in names if name[0] in "kp" and name not in small)
+    unknowns = NetworkUnknowns(whole.points_used, terms, "fy" not in names, small)
     rng = np.random.default_rng(18)
     ratios: list[FloatArray] = []
     for _ in range(count):

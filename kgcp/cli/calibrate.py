@@ -63,7 +63,8 @@ FORMATS = ("opencv", "ros", "metashape", "colmap", "opensfm", "pix4d", "opf", "m
     type=click.Choice(LENSES),
     default="auto",
     show_default=True,
-    help="Terms of distortion: k1 and the significant ones, k1 k2, k1 k2 p1 p2 k3, or all eight.",
+    help="Terms of distortion: k1 k2 p1 p2 k3, of which those that are not significant are kept"
+    " small; k1 k2; k1 k2 p1 p2 k3; or all eight.",
 )
 @click.option(
     "--same-aspect/--free-aspect",

@@ -26,7 +26,11 @@ from kgcp.network.camera_network import (
 )
 from kgcp.network.covariance import precision, tangled
 from kgcp.network.field_turns import with_turns
-from kgcp.network.parameter_choice import DETERMINED, with_chosen_parameters
+from kgcp.network.parameter_choice import (
+    DETERMINED,
+    with_all_terms,
+    with_chosen_parameters,
+)
 from kgcp.network.photographs_apart import photographs_apart, without
 from kgcp.network.space_start import start_in_space
 from kgcp.network.start import better_poses, homography_misfits, start_camera_and_poses
@@ -155,7 +159,9 @@ def _calibrated(problem: CalibrationProblem, start: CameraCalibration | None) ->
             apart = ()
         else:
             chosen = others
-    return _result(_with_bends(chosen), tuple(dict.fromkeys((*dropped, *apart))))
+    chosen = _with_bends(chosen)
+    chosen = replace(chosen, state=with_all_terms(chosen.problem, chosen.state))
+    return _result(chosen, tuple(dict.fromkeys((*dropped, *apart))))
 
 
 def _chosen(problem: CalibrationProblem, state: AdjustedNetwork) -> _Chosen:
@@ -250,6 +256,7 @@ def _result(chosen: _Chosen, dropped: tuple[str, ...]) -> CameraCalibration:
     weak = np.sqrt(cov.diagonal()) > share * state.network.cameras.sd[0]
     weak |= problem.is_at_border(model.names, state.estimate)
     names = np.array(model.names)
+    is_significant = ~np.isin(names, state.unknowns.insignificant)
     observed = problem.observations()
     return CameraCalibration(
         state.camera,
@@ -266,8 +273,13 @@ def _result(chosen: _Chosen, dropped: tuple[str, ...]) -> CameraCalibration:
         rms_px(chosen.fixed.solution),
         problem.radius_scale(state),
         problem.radius_scales(state),
-        tuple(names[weak].tolist()),
-        tangled(model.names, _with_focal_difference(model.names, cov), _MAX_INFLATION),
+        state.unknowns.insignificant,
+        tuple(names[weak & is_significant].tolist()),
+        tangled(
+            names[is_significant].tolist(),
+            _with_focal_difference(model.names, cov)[np.ix_(is_significant, is_significant)],
+            _MAX_INFLATION,
+        ),
         chosen.unclear is not None,
     )
 

@@ -73,6 +73,8 @@ class CameraCalibration:
     rms_fixed_px: float  # per point, with the field as stated
     radius_scale: float  # measured over stated radii: median
     radius_scales: FloatArray  # (v,): the same for each photograph
+    # distortion terms that are not significant, estimated with priors of usual lenses
+    insignificant: tuple[str, ...]
     undetermined: tuple[str, ...]  # camera parameters that these photographs do not determine
     tangled: tuple[str, ...]  # camera parameters that cannot be separated
     # whether a symmetric field may have been turned between photographs without this being noticed

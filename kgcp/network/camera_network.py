@@ -48,6 +48,8 @@ _CENTRE_SD = 0.1
 _FOCAL_SD = 3.0
 _RADIAL_SD = 0.3
 _TANGENTIAL_SD = 0.05
+# The same for terms that are not significant, from what lenses usually have.
+_USUAL_SD = {"k2": 0.02, "p1": 0.0005, "p2": 0.0005, "k3": 0.01}
 CENTRE_DETERMINED = 0.1
 """Largest standard deviation of a principal point that counts as determined, relative to the
 a-priori one. It is 1 % of the frame's longer side."""
@@ -69,11 +71,18 @@ class NetworkUnknowns:
     points: PointModel
     terms: tuple[str, ...]  # distortion terms
     is_same_aspect: bool
+    # further terms, which are not significant; priors keep them as small as in usual lenses
+    insignificant: tuple[str, ...] = ()
 
     @property
     def is_rational(self) -> bool:
         """Whether the distortion is a quotient of two polynomials."""
         return "k4" in self.terms
+
+    def model(self, camera: Camera) -> FrameCameraModel:
+        """Return the camera model with these unknowns; other terms of the camera become zero."""
+        terms = (*self.terms, *self.insignificant)
+        return FrameCameraModel(_without(camera, terms), terms, self.is_same_aspect)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,8 +98,7 @@ class AdjustedNetwork:
     @property
     def model(self) -> FrameCameraModel:
         """The camera model with these unknowns."""
-        terms, is_same_aspect = self.unknowns.terms, self.unknowns.is_same_aspect
-        return FrameCameraModel(_without(self.camera, terms), terms, is_same_aspect)
+        return self.unknowns.model(self.camera)
 
     @property
     def poses(self) -> list[Pose]:
@@ -210,8 +218,7 @@ class CalibrationProblem:
         observed = self.observations()
         if unknowns.is_same_aspect:
             camera = replace(camera, fy=camera.fx)
-        terms = unknowns.terms
-        model = FrameCameraModel(_without(camera, terms), terms, unknowns.is_same_aspect)
+        model = unknowns.model(camera)
         before = np.full_like(observed.places, np.inf)
         for _ in range(_MAX_ADJUSTMENTS):
             offsets = self.eccentricity(camera, estimate, observed).total_px
@@ -221,7 +228,7 @@ class CalibrationProblem:
                 np.zeros(len(self.views), dtype=np.intp),
                 replace(observed, places=observed.places - offsets, cov=cov),
                 self.point_prior(unknowns.points),
-                self.camera_prior(model, camera),
+                self.camera_prior(unknowns, camera),
                 bends,
             )
             start = replace(estimate, cameras=model.values_of(camera)[None])
@@ -314,26 +321,35 @@ class CalibrationProblem:
             sds = np.full_like(sds, 0.1 * self.field.pitch_m)
         return PointPrior(nominal, np.eye(3) * sds[:, None] ** -2.0, bars)
 
-    def camera_prior(self, model: FrameCameraModel, camera: Camera) -> CalibrationPrior:
+    def camera_prior(self, unknowns: NetworkUnknowns, camera: Camera) -> CalibrationPrior:
         """Return the prior of any camera: a central principal point and small distortion."""
         width, height = self.size
         corner = 0.5 * math.hypot(width, height) / camera.mean_focal_px
         middle = {"cx": 0.5 * (width - 1), "cy": 0.5 * (height - 1)}
         values, sd = [], []
-        for name in model.names:
+        for name in unknowns.model(camera).names:
             values.append(middle.get(name, getattr(camera, name) if name[0] == "f" else 0.0))
-            sd.append(self._sd(name, camera, corner))
+            is_usual = name in unknowns.insignificant
+            sd.append(self._sd(name, camera, corner, _USUAL_SD[name] if is_usual else None))
         return CalibrationPrior(np.array([values]), np.array([sd]))
 
-    def _sd(self, name: str, camera: Camera, corner: float) -> float:
-        """Return an a-priori standard deviation; `corner` is the corner's normalised radius."""
+    def _sd(self, name: str, camera: Camera, corner: float, usual: float | None) -> float:
+        """Return an a-priori standard deviation.
+
+        Parameters
+        ----------
+        corner : float
+            Normalised radius of the frame's corner.
+        usual : float, optional
+            Displacement by a distortion term, if it differs from that of any lens.
+        """
         if name in ("fx", "fy"):
             return _FOCAL_SD * camera.mean_focal_px
         if name in ("cx", "cy"):
             return _CENTRE_SD * max(self.size)
         if name in ("p1", "p2"):
-            return _TANGENTIAL_SD / corner
-        return _RADIAL_SD / corner ** _RADIUS_POWER[name]
+            return (usual or _TANGENTIAL_SD) / corner
+        return (usual or _RADIAL_SD) / corner ** _RADIUS_POWER[name]
 
     def radius_scale(self, state: AdjustedNetwork) -> float:
         """Return the median ratio of measured to expected radii; those include distortion."""

@@ -11,9 +11,10 @@ from scipy import stats
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.network.adjust import ROBUST, adjust_network
 from kgcp.network.bursts import place_numbers
-from kgcp.network.calibration_records import LensModel
+from kgcp.network.calibration_records import LensModel, PointModel
 from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem, NetworkUnknowns
 from kgcp.network.covariance import precision
+from kgcp.network.field_deviation import field_deviation
 from kgcp.network.records import Network, Observations, PointPrior
 from kgcp.network.start import refined_poses
 
@@ -93,6 +94,28 @@ def _is_significant(state: AdjustedNetwork, addition: Sequence[str]) -> bool:
     is_determined = sd < DETERMINED * state.network.cameras.sd[0, columns]
     is_large = np.abs(values[columns]) > limit * sd
     return bool(is_determined.all() and is_large.any())
+
+
+def with_all_terms(problem: CalibrationProblem, state: AdjustedNetwork) -> AdjustedNetwork:
+    """Return the adjustment with the terms that were left out because they are not significant.
+
+    A term that is not significant need not be zero. Without it, others take up its effect: the
+    principal point that of p1 and p2, and k1 that of k2 and k3. Their standard deviations would
+    not include this. Therefore all terms are estimated in the end, with priors of usual lenses.
+
+    If a stiff field is not as stated, the terms stay zero, because they would absorb its errors: on
+    BoofCV's regular sheet, the principal point would move by 4 px away from that of a free field.
+    """
+    if problem.settings.lens is not LensModel.AUTO:
+        return state
+    is_stiff = state.unknowns.points is PointModel.STIFF
+    if is_stiff and field_deviation(problem.field, problem.views, state.estimate.points).doubt:
+        return state
+    terms = state.unknowns.terms
+    left_out = tuple(term for term in _TERMS[LensModel.BROWN] if term not in terms)
+    if not left_out:
+        return state
+    return problem.with_unknowns(state, replace(state.unknowns, insignificant=left_out))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,9 +10,9 @@ from enum import StrEnum
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.attitude import rotation_onto
 from kgcp.network.calibration_records import CameraCalibration, LensModel, PointModel
 from kgcp.network.equations import view_rows, whitened
+from kgcp.network.field_deviation import FieldDeviation, field_deviation
 from kgcp.network.focal_trend import FocalTrend, focal_trend
 from kgcp.network.records import PointPrior
 from kgcp.network.sheet_bends import bend_displacements
@@ -28,7 +28,6 @@ _MIN_DISCS = 6  # per photograph
 _MAX_REJECTED_SHARE = 0.1
 _MAX_FOCAL_SD = 0.01  # relative
 _MAX_OPERATOR_RATIO = 3.0  # of a misfit to the standard deviation with which discs are measured
-_MAX_FIELD_RATIO = 2.0  # of the discs' deviations from the field to what it states
 _MAX_BAR_SDS = 3.0  # of a bar's residual
 _MIN_COVERAGE = 0.7
 _MIN_NORMALS_DEG = 15.0  # largest angle between two normals of the field
@@ -48,30 +47,6 @@ class CalibrationGrade(StrEnum):
     GOOD = "good"
     LOOK = "to be checked"
     UNUSABLE = "unusable"
-
-
-@dataclass(frozen=True, slots=True)
-class FieldDeviation:
-    """Deviations of discs from their stated places, without shift, rotation and scale."""
-
-    in_plane_m: float  # RMS along the field's axes x and y
-    height_m: float  # RMS along z
-    # RMS of the deviations over their stated standard deviations
-    in_plane_ratio: float
-    height_ratio: float
-
-    @property
-    def doubt(self) -> str:
-        """In what the field is not as stated; empty: it is."""
-        parts = [
-            f"{1000.0 * off_m:.2f} mm {where}, {ratio:.1f} times as much as stated"
-            for off_m, ratio, where in (
-                (self.in_plane_m, self.in_plane_ratio, "in its plane"),
-                (self.height_m, self.height_ratio, "in height"),
-            )
-            if ratio > _MAX_FIELD_RATIO
-        ]
-        return f"discs are off by {' and by '.join(parts)}" if parts else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +146,9 @@ def calibration_numbers(
         None
         if calibration.points_used is PointModel.FIXED
         else float(np.sqrt(np.mean((heights - heights.mean()) ** 2))),
-        _field_deviation(calibration),
+        None
+        if calibration.points_used is PointModel.FIXED
+        else field_deviation(calibration.field, calibration.views, estimate.points),
         _field_bending(calibration),
         focal_trend(calibration.network, calibration.solution, calibration.precision),
         turned_photographs(calibration),
@@ -191,22 +168,6 @@ def _field_bending(calibration: CameraCalibration) -> FieldBending | None:
         axis=1,
     )[is_used]
     return FieldBending(_rms(heights_m), float(np.sqrt(np.mean(np.sum(moved_px**2, axis=1)))))
-
-
-def _field_deviation(calibration: CameraCalibration) -> FieldDeviation | None:
-    """Return how far the imaged discs are from their stated places."""
-    if calibration.points_used is PointModel.FIXED:
-        return None
-    field = calibration.field
-    imaged = np.unique(np.concatenate([view.point for view in calibration.views]))
-    stated, estimated = field.points_m()[imaged], calibration.solution.estimate.points[imaged]
-    estimated = (estimated - estimated.mean(axis=0)) @ rotation_onto(estimated, stated).T
-    stated = stated - stated.mean(axis=0)
-    # without a measured distance, photographs do not determine the scale of the field
-    scale = 1.0 if field.bars else float(np.sum(stated * estimated) / np.sum(estimated**2))
-    off = scale * estimated - stated
-    ratio = off / field.point_sds_m()[imaged]
-    return FieldDeviation(_rms(off[:, :2]), _rms(off[:, 2]), _rms(ratio[:, :2]), _rms(ratio[:, 2]))
 
 
 def _rms(values: FloatArray) -> float:

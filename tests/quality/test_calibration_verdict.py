@@ -12,6 +12,7 @@ import pytest
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.calibration import CALIBRATION_PARAMETERS
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle_image import Circles3D, circle_images
 from kgcp.geometry.pose import rotation_about
@@ -25,8 +26,7 @@ from kgcp.network.calibration_records import (
     NamedView,
     PointModel,
 )
-from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem
-from kgcp.network.frame_camera import FrameCameraModel
+from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem, NetworkUnknowns
 from kgcp.network.photographs_apart import _view_misfits_px
 from kgcp.network.records import CalibrationPrior
 from kgcp.network.sheet_bends import bend_shapes
@@ -37,6 +37,7 @@ from kgcp.quality.calibration_verdict import (
     judge,
 )
 from kgcp.quality.disc_light import DiscLight
+from kgcp.quality.frame_rays import compare_cameras
 from kgcp.targets.fields.layout import Field, FieldBar, GridKind, Mark
 
 CAMERA = Camera(1600, 1200, 1500.0, 1500.0, 811.0, 583.0, -0.11)
@@ -93,9 +94,39 @@ def test_a_good_calibration_is_called_good() -> None:
     assert np.all(np.abs(errors) < 4.0 * sd)
     assert np.all(sd < 0.5)
     assert result.camera.k1 == pytest.approx(-0.11, abs=0.002)
-    assert result.network.model.names == ("fx", "cx", "cy", "k1")
+    assert result.insignificant == ("k2", "p1", "p2", "k3")
+    assert result.undetermined == result.tangled == ()
     assert result.radius_scale == pytest.approx(1.0, abs=0.001)
     assert 0.0 < np.nanmin(numbers.ray_sd_px) < np.nanmax(numbers.ray_sd_px) < 1.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_standard_deviations_include_terms_that_are_not_significant(seed: int) -> None:
+    """Left out, p1 and p2 would displace the principal point, and k2 and k3 would change k1."""
+    p1, p2, k2 = np.random.default_rng(seed).normal(0.0, [0.0002, 0.0002, 0.01])
+    lens = replace(CAMERA, p1=p1, p2=p2, k2=k2)
+    result = calibrated(views(camera=lens), PointModel.STIFF, LensModel.AUTO)
+    numbers = calibration_numbers(result)
+    sd = dict(zip(CALIBRATION_PARAMETERS, numbers.sd, strict=True))
+    z = {n: (getattr(result.camera, n) - getattr(lens, n)) / sd[n] for n in ("cx", "cy", "k1")}
+    assert np.abs([*z.values()]).max() < 3.5, z
+    off_px = compare_cameras(result.camera, lens).rms_px
+    assert off_px < 2.5 * np.sqrt(np.mean(numbers.ray_sd_px**2))
+
+
+def test_terms_that_are_not_significant_absorb_no_errors_of_a_field() -> None:
+    """A print that is stretched unevenly, by more than it states, would displace the centre."""
+    x, y, zero = FIELD.points_m().T
+    shape = np.column_stack((x * y, y**2 - np.mean(y**2), zero))
+    stretch_m = 0.0015 / np.abs(shape).max() * shape
+    result = calibrated(views(bend_m=stretch_m), PointModel.STIFF, LensModel.AUTO)
+    deviation = calibration_numbers(result).field
+    assert deviation is not None
+    assert "in its plane" in deviation.doubt
+    assert result.insignificant == ()
+    assert result.camera.p1 == result.camera.p2 == 0.0
+    assert result.camera.cx == pytest.approx(811.0, abs=1.0)
+    assert result.camera.cy == pytest.approx(583.0, abs=1.0)
 
 
 def test_two_focal_lengths_are_estimated_where_they_differ() -> None:
@@ -533,10 +564,10 @@ def test_a_diverging_principal_point_is_held_at_the_border_and_reported(
     known_prior = CalibrationProblem.camera_prior
 
     def prior_at_border(
-        problem: CalibrationProblem, model: FrameCameraModel, camera: Camera
+        problem: CalibrationProblem, unknowns: NetworkUnknowns, camera: Camera
     ) -> CalibrationPrior:
-        prior = known_prior(problem, model, camera)
-        at = model.names.index("cx")
+        prior = known_prior(problem, unknowns, camera)
+        at = unknowns.model(camera).names.index("cx")
         values, sd = prior.values.copy(), prior.sd.copy()
         values[0, at], sd[0, at] = border, 1e-3
         return CalibrationPrior(values, sd)

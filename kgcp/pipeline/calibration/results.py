@@ -188,6 +188,7 @@ def _summary(
         "cov_of": CALIBRATION_PARAMETERS,
         "cov": calibration.covariance.cov.tolist(),
         "estimated": calibration.network.model.names,
+        "insignificant": calibration.insignificant,
         "undetermined": calibration.undetermined,
         "tangled": calibration.tangled,
         "photographs": len(photos),

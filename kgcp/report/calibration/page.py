@@ -95,6 +95,8 @@ def parameter_rows(calibration: CameraCalibration) -> list[ParameterRow]:
             continue
         digits = 3 if index < _PIXEL_PARAMETERS else 6
         notes = []
+        if name in calibration.insignificant:
+            notes.append("not significant; kept as small as usual lenses have it")
         if name in calibration.undetermined:
             notes.append("not determined")
         if name in calibration.tangled:

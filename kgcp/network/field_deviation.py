@@ -1,0 +1,64 @@
+"""Deviation of a field's estimated shape from the stated one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import rotation_onto
+from kgcp.network.calibration_records import NamedView
+from kgcp.targets.fields.points import AnyField
+
+_MAX_RATIO = 2.0  # of the discs' deviations from the field to what it states
+
+
+@dataclass(frozen=True, slots=True)
+class FieldDeviation:
+    """Deviation of discs from their stated places, without shift, rotation and scale."""
+
+    in_plane_m: float  # RMS along the field's axes x and y
+    height_m: float  # RMS along z
+    # RMS of the deviations over their stated standard deviations
+    in_plane_ratio: float
+    height_ratio: float
+
+    @property
+    def doubt(self) -> str:
+        """In what the field is not as stated; empty: it is."""
+        parts = [
+            f"{1000.0 * off_m:.2f} mm {where}, {ratio:.1f} times as much as stated"
+            for off_m, ratio, where in (
+                (self.in_plane_m, self.in_plane_ratio, "in its plane"),
+                (self.height_m, self.height_ratio, "in height"),
+            )
+            if ratio > _MAX_RATIO
+        ]
+        return f"discs are off by {' and by '.join(parts)}" if parts else ""
+
+
+def field_deviation(
+    field: AnyField, views: Sequence[NamedView], points: FloatArray
+) -> FieldDeviation:
+    """Return how far the discs that photographs show are from their stated places.
+
+    Parameters
+    ----------
+    points : (m, 3) array
+        Estimated coordinates of all discs [m].
+    """
+    imaged = np.unique(np.concatenate([view.point for view in views]))
+    stated, estimated = field.points_m()[imaged], points[imaged]
+    estimated = (estimated - estimated.mean(axis=0)) @ rotation_onto(estimated, stated).T
+    stated = stated - stated.mean(axis=0)
+    # without a measured distance, photographs do not determine the scale of the field
+    scale = 1.0 if field.bars else float(np.sum(stated * estimated) / np.sum(estimated**2))
+    off = scale * estimated - stated
+    ratio = off / field.point_sds_m()[imaged]
+    return FieldDeviation(_rms(off[:, :2]), _rms(off[:, 2]), _rms(ratio[:, :2]), _rms(ratio[:, 2]))
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
