@@ -24,6 +24,8 @@ class FieldDeviation:
     # RMS of the deviations over their stated standard deviations
     in_plane_ratio: float
     height_ratio: float
+    worst_disc: str  # the disc with more than half of all squared ratios; empty: there is none
+    worst_m: float  # by how much that disc is off; 0: there is none
 
     @property
     def doubt(self) -> str:
@@ -36,7 +38,11 @@ class FieldDeviation:
             )
             if ratio > _MAX_RATIO
         ]
-        return f"discs are off by {' and by '.join(parts)}" if parts else ""
+        if not parts:
+            return ""
+        worst = f"disc {self.worst_disc} alone by {1000.0 * self.worst_m:.2f} mm"
+        others = f"; {worst}" if self.worst_disc else ""
+        return f"discs are off by {' and by '.join(parts)}{others}"
 
 
 def field_deviation(
@@ -57,7 +63,17 @@ def field_deviation(
     scale = 1.0 if field.bars else float(np.sum(stated * estimated) / np.sum(estimated**2))
     off = scale * estimated - stated
     ratio = off / field.point_sds_m()[imaged]
-    return FieldDeviation(_rms(off[:, :2]), _rms(off[:, 2]), _rms(ratio[:, :2]), _rms(ratio[:, 2]))
+    squares = np.sum(ratio**2, axis=1)
+    worst = int(squares.argmax())
+    is_alone = squares[worst] > 0.5 * squares.sum()
+    return FieldDeviation(
+        _rms(off[:, :2]),
+        _rms(off[:, 2]),
+        _rms(ratio[:, :2]),
+        _rms(ratio[:, 2]),
+        field.names()[imaged[worst]] if is_alone else "",
+        float(np.linalg.norm(off[worst])) if is_alone else 0.0,
+    )
 
 
 def _rms(values: FloatArray) -> float:

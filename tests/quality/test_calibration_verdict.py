@@ -129,6 +129,16 @@ def test_terms_that_are_not_significant_absorb_no_errors_of_a_field() -> None:
     assert result.camera.cy == pytest.approx(583.0, abs=1.0)
 
 
+@pytest.mark.parametrize("points", [PointModel.STIFF, PointModel.FREE])
+def test_the_only_disc_with_wrong_coordinates_is_named(points: PointModel) -> None:
+    errors_m = np.zeros((len(FIELD.names()), 3))
+    errors_m[13] = 0.002, 0.001, 0.0
+    result = calibrated(views(bend_m=errors_m), points, LensModel.AUTO)
+    verdict = judge(result, calibration_numbers(result))
+    assert verdict.grade is CalibrationGrade.LOOK
+    assert re.search(rf"disc {FIELD.names()[13]} alone by 2\.\d+ mm", verdict.sentence)
+
+
 def test_two_focal_lengths_are_estimated_where_they_differ() -> None:
     wider = calibrated(views(camera=replace(CAMERA, fy=1503.0)), lens=LensModel.AUTO)
     assert wider.camera.fy - wider.camera.fx == pytest.approx(3.0, abs=0.2)
