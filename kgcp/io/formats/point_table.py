@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from kgcp.errors import KgcpError
@@ -26,7 +27,7 @@ _COLUMNS: Mapping[str, Sequence[str]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False)
 class PointTable:
     """A file of surveyed points."""
 
@@ -66,7 +67,7 @@ class PointTable:
                 require_one_place(name, places.setdefault(name, place), place, str(self.path))
         return places
 
-    @property
+    @cached_property
     def _columns(self) -> CsvColumns:
         return read_csv_columns(self.path, ("name",), _XYZ, (), "", self.table.layout)
 
