@@ -22,6 +22,7 @@ from kgcp.quality.frame_rays import CameraDifference
 from kgcp.quality.number_text import minus
 from kgcp.report.html_page import embedded_pictures, page_template
 
+_MUCH_LESS = 0.7  # share of the RMS below which the misfit is worth reading, too
 _PIXEL_PARAMETERS = 4  # the first ones are lengths in pixels
 
 
@@ -122,10 +123,12 @@ def fit_words(calibration: CameraCalibration) -> str:
     )
     remarks = [f"{', '.join(names)} {remark}" for names, remark in weak if names]
     determined = "; ".join(remarks) or "all parameters are determined"
+    misfit = ""
+    if calibration.misfit_px < _MUCH_LESS * calibration.rms_px:
+        misfit = f" ({calibration.misfit_px:.3f} px if discs measured worse than most count less)"
     return (
-        f"The RMS of the residuals is {calibration.rms_px:.3f} px"
-        f" ({calibration.misfit_px:.3f} px if discs measured worse than most count less), the"
-        f" standard deviation of a measured disc {calibration.operator_sd_px:.3f} px; {determined}."
+        f"The RMS of the residuals is {calibration.rms_px:.3f} px{misfit}, the standard deviation"
+        f" of a measured disc {calibration.operator_sd_px:.3f} px; {determined}."
     )
 
 

@@ -97,14 +97,28 @@ def test_a_good_fit_is_reported_with_what_it_does_not_determine(
 ) -> None:
     words = fit_words(calibration)
     assert re.fullmatch(
-        r"The RMS of the residuals is 0\.01\d px \(0\.01\d px if discs measured worse than most"
-        r" count less\), the standard deviation of a measured disc"
+        r"The RMS of the residuals is 0\.01\d px, the standard deviation of a measured disc"
         r" 0\.014 px; all parameters are determined\.",
         words,
     )
     weak = replace(calibration, undetermined=("k2",), tangled=("cx", "p1"))
     said = "k2 not determined by these photographs; cx, p1 cannot be separated."
     assert fit_words(weak).endswith(said)
+
+
+def test_a_disc_that_is_measured_badly_is_not_all_that_is_said_of_the_fit(
+    calibration: CameraCalibration,
+) -> None:
+    (first, *others), residuals = calibration.views, calibration.solution.residuals.copy()
+    covs = first.covs.copy()
+    covs[0] *= 200.0**2
+    residuals[0] = 200.0 * calibration.operator_sd_px
+    worse = replace(
+        calibration,
+        views=(replace(first, covs=covs), *others),
+        solution=replace(calibration.solution, residuals=residuals),
+    )
+    assert re.search(r" px \(0\.01\d px if discs measured worse than most count", fit_words(worse))
 
 
 @pytest.mark.parametrize(
