@@ -61,7 +61,8 @@ _MAX_HOLDINGS = 6  # rounds in which a principal point is held at the frame's bo
 _HELD_SD_PX = 1e-3
 _SETTLED_PX = 0.002  # change of the eccentricities between two adjustments
 _SETTLED_VARIANCE = 1.25  # ratio of the discs' variances between two adjustments
-_RADIUS_POWER = {"k1": 2, "k2": 4, "k3": 6, "k4": 2, "k5": 4, "k6": 6}
+# Power of the radius that a term's displacement, relative to the radius, grows with
+_RADIUS_POWER = {"k1": 2, "k2": 4, "k3": 6, "k4": 2, "k5": 4, "k6": 6, "p1": 1, "p2": 1}
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,27 +330,19 @@ class CalibrationProblem:
         values, sd = [], []
         for name in unknowns.model(camera).names:
             values.append(middle.get(name, getattr(camera, name) if name[0] == "f" else 0.0))
-            is_usual = name in unknowns.insignificant
-            sd.append(self._sd(name, camera, corner, _USUAL_SD[name] if is_usual else None))
+            is_significant = name not in unknowns.insignificant
+            sd.append(self._sd(name, camera, corner, is_significant=is_significant))
         return CalibrationPrior(np.array([values]), np.array([sd]))
 
-    def _sd(self, name: str, camera: Camera, corner: float, usual: float | None) -> float:
-        """Return an a-priori standard deviation.
-
-        Parameters
-        ----------
-        corner : float
-            Normalised radius of the frame's corner.
-        usual : float, optional
-            Displacement by a distortion term, if it differs from that of any lens.
-        """
+    def _sd(self, name: str, camera: Camera, corner: float, *, is_significant: bool) -> float:
+        """Return an a-priori standard deviation; `corner` is the corner's normalised radius."""
         if name in ("fx", "fy"):
             return _FOCAL_SD * camera.mean_focal_px
         if name in ("cx", "cy"):
             return _CENTRE_SD * max(self.size)
-        if name in ("p1", "p2"):
-            return (usual or _TANGENTIAL_SD) / corner
-        return (usual or _RADIAL_SD) / corner ** _RADIUS_POWER[name]
+        of_any_lens = _TANGENTIAL_SD if name in ("p1", "p2") else _RADIAL_SD
+        share = of_any_lens if is_significant else _USUAL_SD[name]
+        return float(share / corner ** _RADIUS_POWER[name])
 
     def radius_scale(self, state: AdjustedNetwork) -> float:
         """Return the median ratio of measured to expected radii; those include distortion."""
@@ -405,6 +398,6 @@ def _determinant(moments: FloatArray) -> FloatArray:
 
 def _without(camera: Camera, terms: Sequence[str]) -> Camera:
     """Return a camera with all distortion terms but these set to zero."""
-    absent = [name for name in (*_RADIUS_POWER, "p1", "p2") if name not in terms]
+    absent = [name for name in _RADIUS_POWER if name not in terms]
     zeros: dict[str, Any] = dict.fromkeys(absent, 0.0)
     return replace(camera, **zeros)

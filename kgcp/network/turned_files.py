@@ -92,7 +92,7 @@ def _improved(blocks: _Blocks, signs: FloatArray) -> FloatArray:
 
 
 def _blocks(calibration: CameraCalibration) -> _Blocks:
-    network = _with_two_focal_lengths(calibration)
+    network = _with_fy_and_tangential_terms(calibration)
     names, camera = network.model.names, calibration.camera
     changing = np.array([names.index(name) for name in _CHANGING])
     solution = calibration.solution
@@ -126,8 +126,8 @@ def _blocks(calibration: CameraCalibration) -> _Blocks:
     )
 
 
-def _with_two_focal_lengths(calibration: CameraCalibration) -> Network:
-    """Return the network with fy, p1 and p2 among the unknowns, which may have been left out."""
+def _with_fy_and_tangential_terms(calibration: CameraCalibration) -> Network:
+    """Return the network with fy, p1 and p2 among the unknowns, if they have been left out."""
     network, camera = calibration.network, calibration.camera
     known = dict(zip(network.model.names, network.cameras.sd[0].tolist(), strict=True))
     terms = tuple(term for term in DISTORTION if term in known or term in _CHANGING)

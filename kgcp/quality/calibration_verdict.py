@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -20,6 +20,7 @@ from kgcp.network.turned_files import turned_photographs
 from kgcp.quality.disc_light import DiscLight
 from kgcp.quality.eccentricity import parameters_if_neglected
 from kgcp.quality.frame_rays import ray_deviations_px
+from kgcp.quality.number_text import listed
 
 _CELLS = (8, 6)  # columns and rows of the grid on which the coverage of the frame is counted
 _MIN_PLACES = 4
@@ -251,7 +252,7 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
     yield from _bar_doubts(calibration)
     if never := discs_that_never_fit(calibration):
         discs = "disc {} does" if len(never) == 1 else "discs {} do"
-        yield f"{discs.format(_listed(never))} not fit in any photograph"
+        yield f"{discs.format(listed(never, _MAX_NAMED))} not fit in any photograph"
     if numbers.coverage < _MIN_COVERAGE:
         yield f"discs cover only {100.0 * numbers.coverage:.0f} % of the frame"
     if numbers.normals_deg < _MIN_NORMALS_DEG:
@@ -262,8 +263,8 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
         yield f"discs are {100.0 * abs(off):.0f} % {other} than stated"
     if others := _photos_of_another_field(calibration):
         yield (
-            f"relative to their spacing, discs in {_listed(others)} have another size than in most"
-            " photographs: give photographs of one field only"
+            f"relative to their spacing, discs in {listed(others, _MAX_NAMED)} have another size"
+            " than in most photographs: give photographs of one field only"
         )
     if calibration.is_turn_unclear:
         yield (
@@ -284,8 +285,8 @@ def _handling_doubts(calibration: CameraCalibration, numbers: CalibrationNumbers
     """Yield what was changed between photographs, or in their files."""
     if numbers.turned:
         yield (
-            f"{_listed(numbers.turned)} would fit the others much better if turned by 180°: the"
-            " principal point is wrong"
+            f"{listed(numbers.turned, _MAX_NAMED)} would fit the others much better if turned"
+            " by 180°: the principal point is wrong"
         )
     if numbers.trend is not None and _is_focus_changing(calibration, numbers):
         change_px = numbers.trend.change_px
@@ -317,12 +318,6 @@ def discs_that_never_fit(calibration: CameraCalibration) -> tuple[str, ...]:
     photographs = np.bincount(point, minlength=len(names))
     used = np.bincount(point[calibration.solution.is_used], minlength=len(names))
     return tuple(names[k] for k in np.flatnonzero((photographs > 1) & (used == 0)).tolist())
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:_MAX_NAMED]) + (
-        f" and {len(names) - _MAX_NAMED} more" if names[_MAX_NAMED:] else ""
-    )
 
 
 def _bar_doubts(calibration: CameraCalibration) -> Iterator[str]:

@@ -1,13 +1,20 @@
-"""Numbers as text: signs, plurals, and digits by the standard deviation."""
+"""Numbers and lists as text: signs, plurals, digits by the standard deviation."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 
 def counted(count: int, noun: str) -> str:
     """Return a count with its noun, in the plural unless it is 1."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def listed(names: Sequence[str], most: int) -> str:
+    """Return names in a row; if there are more than `most`, the others are counted."""
+    shown = ", ".join(names[:most])
+    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
 
 
 def minus(number: str) -> str:

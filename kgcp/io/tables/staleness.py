@@ -14,12 +14,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from kgcp.errors import KgcpError, KgcpWarning
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.io.files.safe_read import unreadable
 from kgcp.io.files.time_text import format_time
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
+from kgcp.io.formats.frame_times import FrameTimes
 from kgcp.io.images.frames import is_chosen, list_frames
 from kgcp.io.images.remote import stamps_of
 from kgcp.io.tables.provenance import (
@@ -88,7 +89,7 @@ def require_current(path: Path, table: pd.DataFrame, flight: Flight) -> None:
     inputs = _json(metadata, b"kgcp.inputs")
     if not inputs:
         if b"pandas" in metadata:
-            _check_joined(path, table, flight)
+            _check_times_alone(path, table, flight)
         return
     digests = _json(metadata, b"kgcp.digests")
     frames_now = _frames_now(flight)
@@ -102,11 +103,15 @@ def require_current(path: Path, table: pd.DataFrame, flight: Flight) -> None:
         raise _outdated(path, flight, changes, _json(metadata, b"kgcp.settings"))
 
 
-def _check_joined(path: Path, table: pd.DataFrame, flight: Flight) -> None:
+def _check_times_alone(path: Path, table: pd.DataFrame, flight: Flight) -> None:
     """Refuse a table of pandas with times other than the flight's, and warn of what is unknown."""
-    changes = [*_changed_times(table, flight, {}, _frames_now(flight))]
-    if changes:
-        raise _outdated(path, flight, changes, {})
+    frames = table.drop_duplicates("frame")
+    times = FlightData(flight, _frames_now(flight) or frames["frame"].to_list()).frame_times
+    then_s, now_s = _times_then_and_now(frames, flight, times)
+    # frames without a time, then or now, may be those of another flight
+    is_changed = np.abs(now_s - then_s) > _TIME_TOLERANCE_S
+    if is_changed.any():
+        raise _outdated(path, flight, [_time_change(frames, then_s, now_s, is_changed)], {})
     warnings.warn(
         f"{path}: pandas wrote it, without what it was made from; a camera or targets changed since"
         " 'kgcp detect' would go unnoticed: leave rows out with --exclude, and give 'kgcp"
@@ -221,7 +226,6 @@ def _changed_times(
 ) -> Iterator[str]:
     """Yield a change if frames have other times now, or no longer have one.
 
-    Without `digests`, frames that have no time then or now may be those of another flight.
     A times file without names can only be assigned to `all_frames`; a table of chosen frames does
     not have them.
     """
@@ -230,29 +234,39 @@ def _changed_times(
     times = FlightData(flight, all_frames or names).frame_times
     if digest(digested_times(flight, names, times)) == digests.get("times"):
         return
+    then_s, now_s = _times_then_and_now(frames, flight, times)
+    is_same = (np.abs(now_s - then_s) <= _TIME_TOLERANCE_S) | (np.isnan(now_s) & np.isnan(then_s))
+    if is_same.all():
+        yield "[frames] times"
+    else:
+        yield _time_change(frames, then_s, now_s, ~is_same)
+
+
+def _times_then_and_now(
+    frames: pd.DataFrame, flight: Flight, times: FrameTimes
+) -> tuple[FloatArray, FloatArray]:
+    """Return the times of frames in a table, and in the flight now, each (n,); NaN: none [s]."""
     then_s = _unix_s(frames["time"])
-    now_s = np.array([times.time_s.get(name, np.nan) for name in names]) + _to_middle_s(
-        frames, flight
-    )
+    now_s = np.array([times.time_s.get(name, np.nan) for name in frames["frame"]])
+    now_s += _to_middle_s(frames, flight)
     if flight.may_use_exif_times:
         is_exif = (frames["time_source"] == TimeSource.EXIF.value).to_numpy()
         now_s = np.where(np.isnan(now_s) & is_exif, then_s, now_s)
-    is_same = (np.abs(now_s - then_s) <= _TIME_TOLERANCE_S) | (np.isnan(now_s) & np.isnan(then_s))
-    if not digests:
-        is_same |= np.isnan(now_s) | np.isnan(then_s)
-    changed = np.flatnonzero(~is_same)
-    if not changed.size:
-        if digests:
-            yield "[frames] times"
-        return
+    return then_s, now_s
+
+
+def _time_change(
+    frames: pd.DataFrame, then_s: FloatArray, now_s: FloatArray, is_changed: BoolArray
+) -> str:
+    """Say which frames have other times now: all shifted alike, or the first of them."""
+    changed = np.flatnonzero(is_changed)
     changed_times = f"[frames] times of {len(changed)} of {len(frames)} frames"
     shifts_s = (now_s - then_s)[changed]
     if np.ptp(shifts_s) <= _SHIFT_TOLERANCE_S:
-        yield f"{changed_times} (by {np.median(shifts_s):+.6g} s)"
-    else:
-        first = changed[0]
-        was, now = (_time_text(float(time_s[first])) for time_s in (then_s, now_s))
-        yield f"{changed_times} ({names[first]}: {was} → {now})"
+        return f"{changed_times} (by {np.median(shifts_s):+.6g} s)"
+    first = changed[0]
+    was, now = (_time_text(float(time_s[first])) for time_s in (then_s, now_s))
+    return f"{changed_times} ({frames['frame'].iloc[first]}: {was} → {now})"
 
 
 def _time_text(time_s: float) -> str:

@@ -33,7 +33,7 @@ from kgcp.network.ground.position_check import WrongPosition, wrong_position
 from kgcp.network.ground.resection import MIN_POINTS
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
-from kgcp.quality.number_text import rounded
+from kgcp.quality.number_text import listed, rounded
 
 _SIGNIFICANT_SIGMAS = 3.0  # a larger common scale of the distances is reported
 _MIN_SCALE = 1e-4  # of the distances, that is reported; no print or survey is better
@@ -151,9 +151,8 @@ class FlightPoses:
                 )
         unstated = self._targets_counted_as_exact
         if unstated:
-            more = f" and {len(unstated) - _MAX_NAMED} more" if len(unstated) > _MAX_NAMED else ""
             doubts.append(
-                f"sd_position_m is not stated for {', '.join(unstated[:_MAX_NAMED])}{more}: the"
+                f"sd_position_m is not stated for {listed(unstated, _MAX_NAMED)}: the"
                 " standard deviations of the poses count these positions as exact; state in"
                 " flight.toml how accurate they are, and repeat the command"
             )

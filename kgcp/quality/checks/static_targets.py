@@ -19,7 +19,7 @@ from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.sighting import Sighting, unmistakable
 from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
-from kgcp.quality.number_text import rounded
+from kgcp.quality.number_text import listed, rounded
 
 # A distance between two targets in one frame contradicts their positions if it is off by more than
 # this number of standard deviations.
@@ -384,11 +384,10 @@ def _frame_doubts(pairs: Sequence[_Pair], wrong: AbstractSet[_Pair]) -> Iterator
     lone = [key for key, count in against.items() if count >= 2 and 2 * count > distances[key]]
     if not lone:
         return
-    words = ", ".join(f"{name} in {frame}" for frame, name in lone[:_MAX_NAMED])
-    more = f" and {len(lone) - _MAX_NAMED} more" if len(lone) > _MAX_NAMED else ""
+    words = listed([f"{name} in {frame}" for frame, name in lone], _MAX_NAMED)
     yield mild(
         Cause.SINGLE_FRAMES,
-        f"static targets: {words}{more} do not fit their distances to most others",
+        f"static targets: {words} do not fit their distances to most others",
         "look at them with 'kgcp detect --overlay', and leave them out (--exclude)",
         {"measurements": float(len(lone))},
     )

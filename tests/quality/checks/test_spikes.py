@@ -159,9 +159,8 @@ def test_a_jump_to_another_vehicle_or_height_is_grave(rate_hz: float, gap_s: flo
     position_m[time_s >= 50.0] += [0.0, 0.0, 130.0]
     (doubt,) = check_spikes(motion(time_s, position_m))
     assert (doubt.code, doubt.is_grave) == (Cause.TRAJECTORY_SPIKE, True)
-    assert doubt.figures["jump_m"] == pytest.approx(
-        300.0, abs=25.0
-    )  # in a gap, the drive adds to it
+    # in a gap, the drive adds to the jump
+    assert doubt.figures["jump_m"] == pytest.approx(300.0, abs=25.0)
     assert doubt.figures["jumps"] == 2.0
     assert "UTC, and goes on from there, and at 1 other place less far" in doubt.sentence
 

@@ -28,6 +28,7 @@ from kgcp.io.formats.calibrations import (
 )
 from kgcp.io.formats.calibrations.entry import Entry
 from kgcp.io.formats.registry import Registry
+from kgcp.quality.number_text import listed
 
 FORMATS: Registry[Callable[[ForeignFile], Sequence[Entry]]] = Registry(
     "a calibration",
@@ -45,6 +46,8 @@ FORMATS: Registry[Callable[[ForeignFile], Sequence[Entry]]] = Registry(
         "ros": (ros.matches, ros.entries),
     },
 )
+
+_MAX_NAMED = 8  # cameras in a message
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,19 +119,17 @@ def _chosen(
     if camera is None:
         if len(entries) == 1:
             return entries[0]
-        raise file.error(f"holds the cameras {_listed(names)}", words.several_cameras)
+        raise file.error(
+            f"holds the cameras {listed([*map(repr, names)], _MAX_NAMED)}", words.several_cameras
+        )
     chosen = [entry for entry in entries if entry.name == camera]
     if len(chosen) != 1:
         count = "several cameras" if chosen else "no camera"
         raise file.error(
-            f"holds {count} {camera!r}, but {_listed(names)}", "correct [camera] camera"
+            f"holds {count} {camera!r}, but {listed([*map(repr, names)], _MAX_NAMED)}",
+            "correct [camera] camera",
         )
     return chosen[0]
-
-
-def _listed(names: Sequence[str], max_names: int = 8) -> str:
-    shown = ", ".join(repr(name) for name in names[:max_names])
-    return shown if len(names) <= max_names else f"{shown} and {len(names) - max_names} more"
 
 
 def _agreed_size(
