@@ -48,6 +48,7 @@ class GroundFlight:
     )
     diameter_m: float = 0.9  # as printed
     stated_diameter_m: float = 0.9  # as flight.toml has it
+    stated_camera: Camera = CAMERA  # as flight.toml has it
     frames: int = 12
     seed: int = 1
     wrong: dict[tuple[int, str], FloatArray] = field(default_factory=dict)  # errors [m]
@@ -102,7 +103,21 @@ class GroundFlight:
         )
         scale = self.stated_diameter_m / self.diameter_m
         size = np.diag([scale, scale, scale, 1.0, 1.0, 1.0])
+        if self.stated_camera is not CAMERA:
+            moved = self._as_by_stated_camera(moved)
         return Pose(moved.rotation, scale * moved.translation_m), size @ cov @ size
+
+    def _as_by_stated_camera(self, pose: Pose) -> Pose:
+        """The pose that gives a ring the same image in the camera of flight.toml."""
+        angles = np.arange(48) * (math.pi / 24.0)
+        rim = 0.5 * self.diameter_m * np.stack((np.cos(angles), np.sin(angles), 0.0 * angles), -1)
+        camera = self.stated_camera
+        matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0, 0, 1.0]])
+        lens = np.array([camera.k1, camera.k2, camera.p1, camera.p2])
+        start = cv2.Rodrigues(pose.rotation)[0], pose.translation_m[:, None].copy()
+        pixels = CAMERA.project(pose.transform(rim[:, :2]))
+        _, turn, shift = cv2.solvePnP(rim, pixels, matrix, lens, *start, useExtrinsicGuess=True)
+        return Pose(cv2.Rodrigues(turn)[0].astype(np.float64), np.asarray(shift[:, 0], np.float64))
 
     def write(self, folder: Path, *, sd_position_m: float = 0.01) -> Path:
         """Write flight.toml, blank frames, reference.csv and the detections."""
@@ -121,12 +136,13 @@ class GroundFlight:
         return folder
 
     def _toml(self, sd_position_m: float) -> str:
+        camera = self.stated_camera
         lines = [
             'name = "ground"',
             f'crs = "{CRS}"',
             "[camera]",
-            *(f"{key} = {getattr(CAMERA, key)!r}" for key in ("width", "height", "fx", "fy")),
-            *(f"{key} = {getattr(CAMERA, key)!r}" for key in ("cx", "cy", "k1")),
+            *(f"{key} = {getattr(camera, key)!r}" for key in ("width", "height", "fx", "fy")),
+            *(f"{key} = {getattr(camera, key)!r}" for key in ("cx", "cy", "k1")),
             "[reference]",
             'poses = "reference.csv"',
         ]
@@ -157,7 +173,7 @@ class GroundFlight:
 
     def _row(self, frame: int, target: int) -> dict[str, object]:
         pose, cov = self.measured(frame, target)
-        x, y = CAMERA.project(pose.translation_m[None])[0].tolist()
+        x, y = self.stated_camera.project(pose.translation_m[None])[0].tolist()
         name = self.names[target]
         return {
             **_NULL_ROW,

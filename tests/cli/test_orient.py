@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,6 +28,7 @@ from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, photograph
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.presets import preset
 from kgcp.targets.fields.layout import Field, GridKind, Mark
+from tests.ground_flight import CAMERA as TRUE_CAMERA
 from tests.ground_flight import GroundFlight
 
 
@@ -100,6 +102,28 @@ def test_a_common_error_of_all_diameters_displaces_no_pose(
     placed = run("place", folder, "--poses", folder / "kgcp" / "poses.csv", "--json")
     for target in json.loads(placed.stdout)["targets"]:
         assert abs(target["diameter_m"] - 0.9) < 3.0 * target["sd_diameter_m"] < 0.003
+
+
+@pytest.mark.parametrize(
+    ("camera", "words"),
+    [
+        (replace(TRUE_CAMERA, cx=823.2), r"\(they fit cx = 803\.\d+ ± 0\.\d+ instead of 823\.2"),
+        (replace(TRUE_CAMERA, k1=0.0), r"k1 = -0\.05\d* ± 0\.00\d+ instead of 0\.0"),
+        (replace(TRUE_CAMERA, fx=2335.0, fy=2335.0), r"fx = 2299\.\d ± \d\.\d instead of 2335"),
+    ],
+)
+def test_the_calibration_of_another_camera_is_reported(
+    tmp_path: Path, camera: Camera, words: str
+) -> None:
+    """Frame by frame, poses take up its error: they were off by 0.3 m, without a word."""
+    flight = GroundFlight(stated_camera=camera)
+    folder = flight.write(tmp_path / "flight")
+    result = run("orient", folder)
+    assert result.exit_code == 0, result.stderr
+    off = np.linalg.norm(poses_of(folder, flight)[0], axis=1)
+    (doubt,) = re.findall(f"contradict the camera's calibration .*{words}.*", result.stderr)
+    said_m = float(re.findall(r"off by about ([\d.]+) m", doubt)[0])
+    assert said_m == pytest.approx(np.median(off), rel=0.3)
 
 
 def misplace(folder: Path, flight: GroundFlight, off_m: FloatArray) -> None:

@@ -9,7 +9,7 @@ from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition
 from kgcp.network.ground.frame_poses import UNSTATED_SCALE_SD, FramePose
 from kgcp.network.ground.point_images import CameraPose
-from kgcp.network.ground.position_check import WrongPosition, wrong_position
+from kgcp.network.ground.position_check import WrongCamera, WrongPosition, wrong_input
 from tests.ground_flight import CAMERA, GroundFlight
 
 SD_PX, SD_DISTANCE = 0.005, 2e-4
@@ -54,7 +54,9 @@ def checked(
     positions = {
         name: TargetPosition(place, cov_m2) for name, place in zip(names, places_m, strict=True)
     }
-    return names[wrong], wrong_position(poses, sightings, positions, CAMERA, UNSTATED_SCALE_SD)
+    found = wrong_input(poses, sightings, positions, CAMERA, UNSTATED_SCALE_SD)
+    assert not isinstance(found, WrongCamera)
+    return names[wrong], found
 
 
 @pytest.mark.parametrize(("targets", "named"), [(4, (2.2, 3.6)), (6, (1.05, 2.0))])

@@ -16,7 +16,7 @@ from kgcp.measurement.plate_prior import SceneRotation
 from kgcp.network.ground.field_pose import orient_by_field
 from kgcp.network.ground.frame_poses import UNSTATED_SCALE_SD, FramePose, orient_frames
 from kgcp.network.ground.point_images import CameraPose
-from kgcp.network.ground.position_check import wrong_position
+from kgcp.network.ground.position_check import wrong_input
 from kgcp.targets.fields.points import AnyField
 from tests.ground_flight import CAMERA as GLOBAL_CAMERA
 from tests.ground_flight import GroundFlight
@@ -132,7 +132,7 @@ def test_deviations_cover_unknown_motion(targets: int) -> None:
             z.append(error_of(found, CameraPose(flight.centres[row], flight.rotations[row])))
             assert found.residuals is not None
             off_px.append(np.abs(found.residuals[:, :2]).max())
-        assert wrong_position(poses, sightings, places, CAMERA, UNSTATED_SCALE_SD) is None
+        assert wrong_input(poses, sightings, places, CAMERA, UNSTATED_SCALE_SD) is None
     assert len(z) >= 14  # of six errors, of which about three are independent
     assert 0.74 < float(np.sqrt(np.mean(np.square(z)))) < 1.27  # 99 % of 48 values
     assert float(np.max(off_px)) < 1.0  # three pixels without the motion

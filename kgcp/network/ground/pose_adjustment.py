@@ -277,9 +277,13 @@ def _without_common(square: FloatArray, precisions: FloatArray) -> FloatArray:
 
 
 def position_equations(
-    camera: Camera, images: PointImages, pose: CameraPose, sd_focal: float
+    camera: Camera,
+    images: PointImages,
+    pose: CameraPose,
+    sd_focal: float,
+    by_calibration: FloatArray,
 ) -> tuple[FloatArray, FloatArray, float] | None:
-    """Return normal equations of corrections to the points' positions, with the pose eliminated.
+    """Return normal equations of corrections to positions and calibration, without the pose.
 
     Parameters
     ----------
@@ -289,12 +293,14 @@ def position_equations(
         Approximate pose.
     sd_focal : float
         As for `orient`.
+    by_calibration : (n, 3, k) array
+        Derivatives of computed minus observed places and logarithms of distances.
 
     Returns
     -------
-    normal : (3 n, 3 n) array
+    normal : (3 n + k, 3 n + k) array
         Singular, because all points together can be shifted and rotated.
-    right : (3 n,) array
+    right : (3 n + k,) array
     squares : float
         Weighted squares of the residuals without corrections.
         None instead of all three if a point is behind the camera, or the pose is not determined.
@@ -305,9 +311,8 @@ def position_equations(
     exact = replace(images, position_cov=np.zeros_like(images.position_cov))
     unknowns = 7 if sd_focal else 6
     measured = np.nan_to_num(near.residuals)[..., None]
-    rows = np.concatenate(
-        (_by_positions(near), measured, near.design[:, :, :unknowns], near.common), axis=2
-    )
+    corrected = _by_positions(near), by_calibration, measured
+    rows = np.concatenate((*corrected, near.design[:, :, :unknowns], near.common), axis=2)
     square = np.einsum(
         "nmp,nmq->pq", rows, np.linalg.solve(_covariances(exact, near.by_point), rows)
     )
@@ -340,14 +345,29 @@ def position_slopes(
         Derivatives of the pose's step.
     """
     near = _linearised(camera, images, pose)
+    slopes = _pose_slopes(images, near, _by_positions(near), sd_focal)
+    return slopes.reshape(len(slopes), len(images), 3)
+
+
+def calibration_slopes(
+    camera: Camera, images: PointImages, pose: CameraPose, by_calibration: FloatArray
+) -> FloatArray:
+    """Return the derivatives (6, k) of an adjusted pose, for `by_calibration` as above."""
+    return _pose_slopes(images, _linearised(camera, images, pose), by_calibration, 0.0)
+
+
+def _pose_slopes(
+    images: PointImages, near: _Linearised, by_cause: FloatArray, sd_focal: float
+) -> FloatArray:
+    """Return the derivatives of an adjusted pose by what changes observations by `by_cause`."""
     unknowns = 7 if sd_focal else 6
-    rows = np.concatenate((near.design[:, :, :unknowns], -_by_positions(near), near.common), axis=2)
+    rows = np.concatenate((near.design[:, :, :unknowns], -by_cause, near.common), axis=2)
     weighted = np.linalg.solve(_covariances(images, near.by_point), rows)
     reduced = _without_common(np.einsum("nmp,nmq->pq", rows, weighted), near.precisions)
-    normal, by_positions = reduced[:unknowns, :unknowns], reduced[:unknowns, unknowns:]
+    normal = reduced[:unknowns, :unknowns]
     if sd_focal:
         normal[6, 6] += 1.0 / sd_focal**2
-    return np.asarray(np.linalg.solve(normal, by_positions)).reshape(unknowns, len(images), 3)
+    return np.asarray(np.linalg.solve(normal, reduced[:unknowns, unknowns:]))
 
 
 def scale_at(camera: Camera, images: PointImages, pose: CameraPose) -> float:

@@ -1,30 +1,42 @@
-"""Check of the targets' positions against each other, from all oriented frames of a flight.
+"""Check of positions and calibration against each other, from all oriented frames of a flight.
 
-In a single frame with few targets, the pose absorbs most of a wrong position. Frames from other
-directions contradict it. Therefore corrections of all positions are estimated from all frames, and
-compared with the standard deviations of the positions.
+In a single frame with few targets, the pose absorbs most of a wrong position or calibration. Frames
+from other directions contradict it. Therefore corrections of all positions and of the calibration
+are estimated from all frames, and compared with their standard deviations.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, distort_jacobian_by_calibration
 from kgcp.geometry.camera import Camera
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition
 from kgcp.measurement.plate_prior import SceneRotation
+from kgcp.measurement.systematic_errors import pose_by_calibration
 from kgcp.network.ground.frame_poses import NO_ROTATIONS, SD_FOCAL, FramePose, point_images
-from kgcp.network.ground.pose_adjustment import position_equations
+from kgcp.network.ground.point_images import PointImages
+from kgcp.network.ground.pose_adjustment import calibration_slopes, position_equations
 
 _DOUBTFUL_CHI2 = 16.3  # limit of three coordinates; chance exceeds it once in 1000 targets
 _SAME_CHI2 = 13.8  # targets within this Δχ² of the worst one may be the wrong one instead
 # Singular values below this share count as zero: the frames do not check such a direction.
 _MIN_DETERMINED = 1e-6
 _MIN_SD_M = 1e-4  # lower limit of a position's standard deviation: no survey is better
+_CHECKED = CALIBRATION_PARAMETERS[:5]  # fx, fy, cx, cy, k1: what frames together determine best
+_RING_SHARE = 0.01  # radius of a ring whose distance depends on the calibration, of the distance
+_WRONG_CAMERA_CHI2 = 20.5  # limit of five parameters; chance exceeds it once in 1000 flights
+_MAX_OFF_SDS = 3.0  # by which a wrong calibration displaces cameras that are not reported
+_NAMED_SDS = 4.0  # by which a parameter is off that is named
+# A-priori standard deviations of a camera that may be any: of its lengths, as a share of the focal
+# length, and of k1.
+_CAMERA_SHARE_SD, _CAMERA_K1_SD = 0.1, 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,15 +58,56 @@ class WrongPosition:
     chi2: float
 
 
-def wrong_position(
+@dataclass(frozen=True, slots=True, eq=False)
+class WrongCamera:
+    """A calibration that the images contradict.
+
+    Attributes
+    ----------
+    parameters : mapping of str to (float, float)
+        Parameters that are wrong, with values and standard deviations that fit the images.
+    off_m : float
+        By how far the wrong calibration displaces a camera; the median.
+    off_sds : float
+        The same in stated standard deviations.
+    """
+
+    parameters: Mapping[str, tuple[float, float]]
+    off_m: float
+    off_sds: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Equations:
+    """Normal equations of corrections to n positions and the calibration, from all frames."""
+
+    normal: FloatArray  # (3 n + k, 3 n + k)
+    right: FloatArray  # (3 n + k,)
+    squares: float  # of the weighted residuals without corrections
+    freedom: int
+    prior_m2: FloatArray  # (3 n, 3 n): covariance of the positions
+    oriented: Sequence[tuple[FramePose, PointImages, FloatArray]]  # with `_by_calibration`
+
+    @property
+    def positions(self) -> slice:
+        return slice(len(self.prior_m2))
+
+    def noise_factor(self, count: int) -> float:
+        """Return the factor of the images' variances if the first `count` unknowns are free."""
+        normal, right = self.normal[:count, :count], self.right[:count]
+        free = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
+        return max(1.0, (self.squares - float(free @ right)) / max(1, self.freedom - count))
+
+
+def wrong_input(
     poses: Sequence[FramePose],
     sightings: Sequence[Sighting],
     positions: Mapping[str, TargetPosition],
     camera: Camera,
     sd_scale: float,
     rotations: Mapping[str, SceneRotation] = NO_ROTATIONS,
-) -> WrongPosition | None:
-    """Return the position that the frames of a flight contradict most; None: none is doubtful.
+) -> WrongPosition | WrongCamera | None:
+    """Return what the frames of a flight contradict most; None: nothing is doubtful.
 
     Parameters
     ----------
@@ -68,17 +121,20 @@ def wrong_position(
     names = list(dict.fromkeys(name for used in of_frames for name in used))
     if not names:
         return None
-    normal, right, squares, freedom = _equations(
+    equations = _equations(
         poses, by_frame_and_target, positions, names, camera, sd_scale, rotations
     )
-    prior = np.zeros_like(normal)
-    for row, name in enumerate(names):
-        cov = positions[name].cov_m2
-        position_cov = _MIN_SD_M**2 * np.eye(3) + (0.0 if cov is None else cov)
-        prior[3 * row : 3 * row + 3, 3 * row : 3 * row + 3] = position_cov
+    position = _wrong_position(equations, names)
+    wrong, chi2 = _wrong_camera(equations, camera)
+    return wrong if wrong and not (position and position.chi2 > chi2) else position
+
+
+def _wrong_position(equations: _Equations, names: Sequence[str]) -> WrongPosition | None:
+    """Return the position that the frames contradict most; None: none is doubtful."""
+    at, prior = equations.positions, equations.prior_m2
+    normal, right = equations.normal[at, at], equations.right[at]
     # residuals that no corrections explain scale the noise of the images, but not the prior
-    free = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
-    factor = max(1.0, (squares - float(free @ right)) / max(1, freedom - 3 * len(names)))
+    factor = equations.noise_factor(len(normal))
     gain = np.linalg.solve(np.eye(len(normal)) + prior @ (normal / factor), prior)
     corrections, correction_cov = gain @ right / factor, prior - gain
     blocks = [slice(3 * row, 3 * row + 3) for row in range(len(names))]
@@ -97,6 +153,48 @@ def wrong_position(
     )
 
 
+def _wrong_camera(equations: _Equations, camera: Camera) -> tuple[WrongCamera | None, float]:
+    """Return the calibration's error if it matters, and the decrease of χ² by correcting it."""
+    count, prior = len(equations.normal), equations.prior_m2
+    is_focal_free = any(pose.sd_focal_scale is not None for pose, *_ in equations.oriented)
+    if is_focal_free or equations.freedom <= count:
+        return None, 0.0
+    factor = equations.noise_factor(count)
+    normal, right = equations.normal / factor, equations.right / factor
+    # corrections of the positions, with their a-priori covariance, are eliminated
+    places, lens = equations.positions, slice(len(prior), None)
+    gain = np.linalg.solve(np.eye(len(prior)) + prior @ normal[places, places], prior)
+    by_places = normal[lens, places] @ gain
+    lengths = _CAMERA_SHARE_SD * camera.mean_focal_px
+    sds = [_CAMERA_K1_SD if name == "k1" else lengths for name in _CHECKED]
+    before = np.diag(np.array(sds) ** -2.0)
+    cov = np.linalg.inv(normal[lens, lens] - by_places @ normal[places, lens] + before)
+    rest = right[lens] - by_places @ right[places]
+    corrections = cov @ rest
+    chi2 = float(rest @ corrections)
+    if chi2 < _WRONG_CAMERA_CHI2:
+        return None, chi2
+    off_m, off_sds = [], []
+    for pose, images, by_calibration in equations.oriented:
+        if pose.pose is None or pose.cov is None:
+            continue
+        slopes = calibration_slopes(camera, images, pose.pose, by_calibration)[:3]
+        off = slopes @ corrections
+        # what the frames determine badly counts less
+        off_cov = pose.cov[:3, :3] + slopes @ cov @ slopes.T
+        off_m.append(float(np.linalg.norm(off)))
+        off_sds.append(math.sqrt(float(off @ np.linalg.solve(off_cov, off))))
+    if not np.median(off_sds) > _MAX_OFF_SDS:
+        return None, chi2
+    found_sds = np.sqrt(np.diag(cov))
+    parameters = {
+        name: (getattr(camera, name) + float(correction), float(sd))
+        for name, correction, sd in zip(_CHECKED, corrections, found_sds, strict=True)
+        if abs(correction) > _NAMED_SDS * sd
+    }
+    return WrongCamera(parameters, float(np.median(off_m)), float(np.median(off_sds))), chi2
+
+
 def _equations(
     poses: Sequence[FramePose],
     by_frame_and_target: Mapping[tuple[str, str], Sighting],
@@ -105,10 +203,11 @@ def _equations(
     camera: Camera,
     sd_scale: float,
     rotations: Mapping[str, SceneRotation],
-) -> tuple[FloatArray, FloatArray, float, int]:
-    """Return normal matrix, right-hand side, weighted squares and redundancy of all frames."""
-    normal, right = np.zeros((3 * len(names), 3 * len(names))), np.zeros(3 * len(names))
+) -> _Equations:
+    count = 3 * len(names) + len(_CHECKED)
+    normal, right = np.zeros((count, count)), np.zeros(count)
     squares, freedom = 0.0, 0
+    oriented = []
     for pose in poses:
         if pose.pose is None or pose.residuals is None:
             continue
@@ -116,12 +215,36 @@ def _equations(
         sightings = [by_frame_and_target[pose.frame, name] for name in used]
         images = point_images(sightings, positions, sd_scale, camera, rotations.get(pose.frame))
         has_free_focal = pose.sd_focal_scale is not None
-        equations = position_equations(camera, images, pose.pose, SD_FOCAL * has_free_focal)
+        by_calibration = _by_calibration(camera, sightings)
+        equations = position_equations(
+            camera, images, pose.pose, SD_FOCAL * has_free_focal, by_calibration
+        )
         if equations is None:
             continue
-        at = np.ravel([3 * names.index(name) + np.arange(3) for name in used])
+        of_points = np.ravel([3 * names.index(name) + np.arange(3) for name in used])
+        at = np.concatenate((of_points, np.arange(3 * len(names), count)))
         normal[np.ix_(at, at)] += equations[0]
         right[at] += equations[1]
         squares += equations[2]
         freedom += 2 * len(used) + int(np.count_nonzero(images.has_distance)) - 6 - has_free_focal
-    return normal, right, squares, freedom
+        oriented.append((pose, images, by_calibration))
+    prior = np.zeros((3 * len(names), 3 * len(names)))
+    for row, name in enumerate(names):
+        cov = positions[name].cov_m2
+        position_cov = _MIN_SD_M**2 * np.eye(3) + (0.0 if cov is None else cov)
+        prior[3 * row : 3 * row + 3, 3 * row : 3 * row + 3] = position_cov
+    return _Equations(normal, right, squares, freedom, prior, oriented)
+
+
+def _by_calibration(camera: Camera, sightings: Sequence[Sighting]) -> FloatArray:
+    """Return the derivatives (n, 3, k) of computed minus measured places and logs of distances."""
+    pixels = np.array([each.centre_px for each in sightings])
+    slopes = np.zeros((len(sightings), 3, len(_CHECKED)))
+    by_all = distort_jacobian_by_calibration(camera, camera.undistort(pixels))
+    slopes[:, :2] = by_all[:, :, : len(_CHECKED)]
+    for row, each in enumerate(sightings):
+        if each.pose is not None:
+            radius_m = _RING_SHARE * each.pose.distance_m
+            by_pose = pose_by_calibration(camera, radius_m, each.pose)[:3, : len(_CHECKED)]
+            slopes[row, 2] = -each.pose.translation_m @ by_pose / each.pose.distance_m**2
+    return slopes

@@ -29,7 +29,7 @@ from kgcp.io.tables.poses import (
 )
 from kgcp.io.tables.provenance import derived_provenance
 from kgcp.network.ground.frame_poses import FramePose, orient_frames, print_scale_sd
-from kgcp.network.ground.position_check import WrongPosition, wrong_position
+from kgcp.network.ground.position_check import WrongCamera, WrongPosition, wrong_input
 from kgcp.network.ground.resection import MIN_POINTS
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
@@ -71,15 +71,15 @@ class FlightPoses:
     local_frame : LocalFrame
     provenance : mapping of str
         The metadata of the table.
-    wrong_position : WrongPosition or None
-        A target whose position contradicts the others; None: there is none.
+    wrong : WrongPosition or WrongCamera or None
+        What the images contradict: a position, or the calibration; None: neither.
     """
 
     flight: Flight
     poses: tuple[FramePose, ...]
     local_frame: LocalFrame
     provenance: Mapping[str, str]
-    wrong_position: WrongPosition | None = None
+    wrong: WrongPosition | WrongCamera | None = None
 
     @property
     def oriented(self) -> tuple[FramePose, ...]:
@@ -131,16 +131,8 @@ class FlightPoses:
                 f"only {oriented} of {len(enough)} frames with {MIN_POINTS} targets or more could"
                 " be oriented by them; look at position_m and at the names of the targets"
             )
-        wrong = self.wrong_position
-        if wrong is not None:
-            first, *others = wrong.targets
-            doubts.append(
-                "the positions of the targets contradict each other: that of"
-                f" {first} is off by {rounded(wrong.off_m)} m"
-                + (f", or that of {' or '.join(others)} is wrong" if others else "")
-                + f" (χ² {wrong.chi2:.0f} of 3), or a diameter is wrong; poses may be off by more"
-                " than is stated"
-            )
+        if self.wrong is not None:
+            doubts.append(self._contradiction(self.wrong))
         if self.distance_scale is not None:
             share, sd = self.distance_scale
             if abs(share) > max(_MIN_SCALE, _SIGNIFICANT_SIGMAS * sd):
@@ -157,6 +149,31 @@ class FlightPoses:
                 " flight.toml how accurate they are, and repeat the command"
             )
         return tuple(doubts)
+
+    def _contradiction(self, wrong: WrongPosition | WrongCamera) -> str:
+        """Return the sentence on what the images contradict."""
+        if isinstance(wrong, WrongPosition):
+            first, *others = wrong.targets
+            return (
+                "the positions of the targets contradict each other: that of"
+                f" {first} is off by {rounded(wrong.off_m)} m"
+                + (f", or that of {' or '.join(others)} is wrong" if others else "")
+                + f" (χ² {wrong.chi2:.0f} of 3), or a diameter is wrong; poses may be off by more"
+                " than is stated"
+            )
+        fitting = [
+            f"{name} = {value:.{digits}f} ± {sd:.{digits}f} instead of"
+            f" {getattr(self.flight.camera, name):.{digits}f}"
+            for name, (value, sd) in wrong.parameters.items()
+            for digits in [max(0, 1 - math.floor(math.log10(sd)))]
+        ]
+        return (
+            "the images contradict the camera's calibration"
+            + (f" (they fit {', '.join(fitting)})" if fitting else "")
+            + f"; poses are off by about {rounded(wrong.off_m)} m,"
+            f" {wrong.off_sds:.0f} stated standard deviations; look whether the calibration is"
+            " that of this camera, lens, zoom and focus"
+        )
 
     @property
     def _targets_counted_as_exact(self) -> list[str]:
@@ -235,9 +252,7 @@ def orient_flight(
             sd_scale=sd_scale,
             rotations=rotations,
         )
-        wrong = wrong_position(
-            poses, sightings, positions.static, flight.camera, sd_scale, rotations
-        )
+        wrong = wrong_input(poses, sightings, positions.static, flight.camera, sd_scale, rotations)
     if not any(each.pose is not None for each in poses):
         reasons = Counter(each.reason for each in poses)
         reason, count = reasons.most_common(1)[0]
