@@ -126,6 +126,13 @@ def test_the_calibration_of_another_camera_is_reported(
     assert said_m == pytest.approx(np.median(off), rel=0.3)
 
 
+def test_exchanged_names_are_among_the_reasons(tmp_path: Path) -> None:
+    exchanged = {(0, "A"): "B", (0, "B"): "A"}
+    result = run("orient", GroundFlight(frames=1, renamed=exchanged).write(tmp_path / "flight"))
+    assert result.exit_code == 1
+    assert "no pose explains three of the points; look at their names" in result.stderr
+
+
 def misplace(folder: Path, flight: GroundFlight, off_m: FloatArray) -> None:
     """State positions that are off by so much (n, 3)."""
     toml = folder / "flight.toml"

@@ -152,14 +152,20 @@ def orient(
         tried.append(start)
         fits += _followed(camera, images, start, sd_focal)
     if not fits:
-        raise NoPoseError("no pose explains three of the points")
+        raise NoPoseError(
+            "no pose explains three of the points; look at their names, at position_m and at the"
+            " camera"
+        )
     fits.sort(key=lambda fit: fit[0])
     cost, pose, used = fits[0]
     others = [fit for fit in fits[1:] if not _is_same(pose, fit[1], 1.0)]
     margin, other = (others[0][0] - cost, others[0][1]) if others else (math.inf, None)
     _require_agreement(images, used, min_points)
     if margin < MIN_MARGIN:
-        raise NoPoseError(f"two poses fit alike (Δχ² {margin:.1f})")
+        raise NoPoseError(
+            f"two poses fit alike (Δχ² {margin:.1f}): there are too few points, they are nearly in"
+            " a line, or the position of one is wrong"
+        )
     cov, residuals, chi2 = _determined(camera, images, pose, used, sd_focal)
     scale = scale_at(camera, images.chosen(used), pose)
     oriented = Resection(pose, cov, residuals, chi2, used, margin, other, scale)
