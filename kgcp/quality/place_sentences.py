@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from kgcp.quality.number_text import minus, rounded
 
 _MAX_RATIO = 3.0  # of a diameter's residual to its standard deviation
 _MAX_CHI2 = 14.2  # of three coordinates, as likely as 3 standard deviations of one
+_ALIKE_SHARE = 0.2  # of their error, by which diameters differ that are all wrong alike
 _MIN_NOISE_PX = 0.005  # of additional noise that is reported
 
 
@@ -47,6 +48,21 @@ def diameter_sentence(placed: PlacedTarget) -> str:
         f" {placed.diameter_m:.{decimals}f} ± {sd:.{decimals}f} m"
         f" ({minus(f'{check.diameter_permille:+.2f}')} ‰, {ratio:.1f} standard deviations),"
         f" {verdict} flight.toml says"
+    )
+
+
+def common_diameter_sentence(placed: Sequence[PlacedTarget]) -> str:
+    """Return the sentence on diameters that are all wrong alike; empty: they are not."""
+    shares = np.array([each.check.diameter_permille for each in placed])
+    if len(placed) < 2 or not all(map(has_other_diameter, placed)):
+        return ""
+    middle = float(np.median(shares))
+    if np.abs(shares - middle).max() > _ALIKE_SHARE * abs(middle):
+        return ""
+    return (
+        f"all {len(placed)} targets measure {abs(middle):.2g} ‰"
+        f" {'larger' if middle > 0.0 else 'smaller'} than stated: unless one printer has made them"
+        " all so, the focal length or the reference poses are wrong, and then the places are, too"
     )
 
 
@@ -121,7 +137,7 @@ def noise_sentence(placement: Placement) -> str:
     parts = [
         f"{value:.3f} px in {what}"
         for value, what in (
-            (noise.centre_px, "the places (mostly of the reference poses)"),
+            (noise.centre_px, "the places (by the reference poses or the calibration)"),
             (noise.outline_px, "size and shape"),
         )
         if value > _MIN_NOISE_PX
@@ -130,7 +146,8 @@ def noise_sentence(placement: Placement) -> str:
         return ""
     return (
         "the images deviate by more than the stated standard deviations:"
-        f" {' and '.join(parts)}; this is taken into account"
+        f" {' and '.join(parts)}; the standard deviations include this, but no error that all"
+        " frames share"
     )
 
 

@@ -40,6 +40,7 @@ from kgcp.pipeline.export import write_formats
 from kgcp.pipeline.frame_priors import motions_while_read
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.place_sentences import (
+    common_diameter_sentence,
     diameter_sentence,
     doubts_of,
     motion_sentence,
@@ -118,6 +119,7 @@ class FlightPlaces:
         """Warnings to consider before the places are used."""
         doubts = [doubt for placed in self.placement.targets for doubt in doubts_of(placed)]
         of_all = (
+            common_diameter_sentence(self.placement.targets),
             step_sentence(self.placement),
             noise_sentence(self.placement),
             motion_sentence(self.motions, self.flight.camera),
