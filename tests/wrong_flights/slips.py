@@ -54,6 +54,13 @@ def _vehicle(column: int, change: Callable[[FloatArray], FloatArray]) -> Callabl
     return lambda one: replace(one, vehicle=_column(one.vehicle, column, change))
 
 
+def _without_satellites(one: Flight) -> Flight:
+    """A receiver that repeats its position from the middle on, once a second."""
+    vehicle = one.vehicle.copy()
+    vehicle[440:, :3] = vehicle[440, :3]
+    return replace(one, vehicle=vehicle[::20], vehicle_s=one.vehicle_s[::20])
+
+
 def _reference(
     column: int, change: Callable[[FloatArray], FloatArray]
 ) -> Callable[[Flight], Flight]:
@@ -207,6 +214,7 @@ ANYWAY: Mapping[str, Slip] = {
     "one epoch 50 m off": _slip(
         _vehicle(0, lambda x: x + 50.0 * (np.arange(len(x)) == 400)), Cause.TRAJECTORY_SPIKE
     ),
+    "last position repeated": _slip(_without_satellites, Cause.TRAJECTORY_SPIKE),
 }
 """With and without reference poses."""
 

@@ -71,7 +71,7 @@ class Cause(StrEnum):
     ATTITUDE = "attitude", "roll or pitch are not those of a vehicle on a road"
     TRAJECTORY_SPIKE = (
         "trajectory_spike",
-        "epochs of the trajectory lie far from those before and after them",
+        "epochs of the trajectory lie far from those before and after them, or repeat a position",
     )
     STANDARD_DEVIATIONS = (
         "standard_deviations",

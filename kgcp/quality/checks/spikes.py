@@ -1,4 +1,4 @@
-"""Check for epochs of a trajectory that jump away from the others, and for joined trajectories."""
+"""Check for epochs of a trajectory that jump or stop at once, and for joined trajectories."""
 
 from __future__ import annotations
 
@@ -26,6 +26,9 @@ _MIN_EPOCHS = 8  # in a trajectory, to decide which part is wrong
 _MIN_LASTING_JUMP_M = 10.0  # no other solution of the ambiguities is so far away
 _MAX_SPEED_M_S = 50.0  # over a gap, unless the vehicle is half as fast elsewhere
 _MIN_ALTERNATION_M = 0.2  # distance of two paths between which epochs alternate
+_MAX_BRAKING_M_S2 = 6.0
+_SAME_PLACE_M = 1e-6  # between epochs of one position; receivers scatter by more
+_MIN_SAME_S = 0.5  # that a position must be repeated, and over which the speed before is taken
 _JOINED_REMEDY = (
     "if files of several vehicles, receivers or CRS were joined, make a flight folder of each;"
     " 'kgcp export-gcp FLIGHT FLIGHT --out FOLDER' joins their points"
@@ -133,6 +136,41 @@ def check_spikes(motion: Motion) -> Iterator[Doubt]:
     if excursions:
         yield _doubt(excursions, motion)
     yield from _lasting_jumps(whole.without(excursions))
+    yield from _repeated_position(motion)
+
+
+def _repeated_position(motion: Motion) -> Iterator[Doubt]:
+    """Yield the doubt about a position that is repeated while the vehicle drives on.
+
+    Receivers and loggers do so without satellites. The vehicle then seems to stop faster than it
+    can brake; a vehicle that really stops is slow before.
+    """
+    time_s = motion.time_s
+    is_same = np.linalg.norm(np.diff(motion.position_m, axis=0), axis=1) < _SAME_PLACE_M
+    changes = np.flatnonzero(np.diff(np.concatenate(([0], is_same, [0]))))
+    first, last = changes[::2], changes[1::2]
+    is_long = (first > 0) & (time_s[last] - time_s[first] >= _MIN_SAME_S)
+    first, last = first[is_long], last[is_long]
+    before = np.minimum(np.searchsorted(time_s, time_s[first] - _MIN_SAME_S), first - 1)
+    base_s = time_s[first] - time_s[before]
+    move_m = np.linalg.norm(motion.position_m[first] - motion.position_m[before], axis=1)
+    is_sudden = move_m > 0.5 * _MAX_BRAKING_M_S2 * base_s**2  # even if it brakes all the time
+    if not is_sudden.any():
+        return
+    lasts_s = np.where(is_sudden, time_s[last] - time_s[first], 0.0)
+    longest = int(np.argmax(lasts_s))
+    others = int(np.count_nonzero(is_sudden)) - 1
+    yield grave(
+        Cause.TRAJECTORY_SPIKE,
+        f"the trajectory repeats one position for {rounded(float(lasts_s[longest]))} s from"
+        f" {_utc(float(time_s[first[longest]]))} UTC on"
+        + (f", and others {counted(others, 'time')}" if others else "")
+        + f", although the vehicle drives at {rounded(float((move_m / base_s)[longest]))} m/s"
+        " just before: no vehicle stops so",
+        "the receiver or logger has filled a gap with its last position: delete these epochs from"
+        " the trajectory's file, so that frames get no points there",
+        {"lasts_s": float(lasts_s[longest]), "times": float(others + 1)},
+    )
 
 
 def _alternation_m(path: _Path) -> float | None:

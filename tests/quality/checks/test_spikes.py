@@ -99,7 +99,8 @@ def test_paths_of_normal_drives_raise_no_doubt() -> None:
         gap = (time_s < 20.0) | (time_s > 27.0)  # half a circle later
         assert not [*check_spikes(motion(time_s[gap], driven(time_s[gap])))]
         braked = np.minimum(time_s, 30.0)  # from 9 m/s to 0 at once
-        assert not [*check_spikes(motion(time_s, driven(braked)))]
+        noise = 1e-3 * np.random.default_rng(4).standard_normal((len(time_s), 3))
+        assert not [*check_spikes(motion(time_s, driven(braked) + noise))]
     assert not [*check_spikes(motion(np.array([0.0, 1.0]), np.zeros((2, 3))))]
 
 
@@ -134,7 +135,23 @@ def test_stops_and_turns_about_raise_no_doubt() -> None:
         stands = np.abs(np.mod(time_s, 30.0) - 20.0) < 5.0
         progress = 5.0 * np.cumsum(~stands) / rate_hz  # from 5 m/s to 0 at once, four times
         position_m = np.column_stack((progress, 0.0 * time_s, 0.0 * time_s))
-        assert not [*check_spikes(motion(time_s, position_m))]
+        noisy = position_m + rng.normal(0.0, 0.001, position_m.shape)
+        assert not [*check_spikes(motion(time_s, noisy))]
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 5.0, 20.0, 100.0])
+def test_a_repeated_position_is_no_stop(rate_hz: float) -> None:
+    """A vehicle brakes first, and may then stand at exactly one place."""
+    time_s = np.arange(0.0, 60.0, 1.0 / rate_hz)
+    (doubt,) = check_spikes(motion(time_s, driven(np.minimum(time_s, 30.0))))
+    assert doubt.code == Cause.TRAJECTORY_SPIKE
+    assert doubt.is_grave
+    assert "from 2026-06-16 08:15:30.000000 UTC on" in doubt.sentence
+    assert doubt.figures["lasts_s"] == pytest.approx(29.5, abs=0.51)
+    brakes_s = 9.0 / 5.0  # at 5 m/s²
+    since_s = np.clip(time_s - 30.0, 0.0, brakes_s)
+    braked = np.minimum(time_s, 30.0) + since_s - since_s**2 / (2.0 * brakes_s)
+    assert not [*check_spikes(motion(time_s, driven(braked)))]
 
 
 def test_float_solutions_with_their_deviations_raise_no_doubt() -> None:
