@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.attitude import rotation_onto
+from kgcp.geometry.attitude import cross_matrix
 from kgcp.network.calibration_records import NamedView
 from kgcp.targets.fields.points import AnyField
 
@@ -56,13 +56,10 @@ def field_deviation(
         Estimated coordinates of all discs [m].
     """
     imaged = np.unique(np.concatenate([view.point for view in views]))
-    stated, estimated = field.points_m()[imaged], points[imaged]
-    estimated = (estimated - estimated.mean(axis=0)) @ rotation_onto(estimated, stated).T
-    stated = stated - stated.mean(axis=0)
+    stated, sds_m = field.points_m()[imaged], field.point_sds_m()[imaged]
     # without a measured distance, photographs do not determine the scale of the field
-    scale = 1.0 if field.bars else float(np.sum(stated * estimated) / np.sum(estimated**2))
-    off = scale * estimated - stated
-    ratio = off / field.point_sds_m()[imaged]
+    off = _without_datum(points[imaged] - stated, stated, sds_m, is_scale_known=bool(field.bars))
+    ratio = off / sds_m
     squares = np.sum(ratio**2, axis=1)
     worst = int(squares.argmax())
     is_alone = squares[worst] > 0.5 * squares.sum()
@@ -74,6 +71,23 @@ def field_deviation(
         field.names()[imaged[worst]] if is_alone else "",
         float(np.linalg.norm(off[worst])) if is_alone else 0.0,
     )
+
+
+def _without_datum(
+    off: FloatArray, stated: FloatArray, sds_m: FloatArray, *, is_scale_known: bool
+) -> FloatArray:
+    """Return deviations (n, 3) without the shift, small rotation and scale that explain most.
+
+    Weighted by the stated standard deviations: otherwise, roughly surveyed discs would turn and
+    shift the accurate ones.
+    """
+    arms = stated - stated.mean(axis=0)
+    shift = np.broadcast_to(np.eye(3), (len(arms), 3, 3))
+    columns = [shift, cross_matrix(arms)] + ([] if is_scale_known else [arms[..., None]])
+    design = np.concatenate(columns, axis=2)
+    by_datum = (design / sds_m[..., None]).reshape(off.size, -1)
+    datum = np.linalg.lstsq(by_datum, (off / sds_m).ravel())[0]
+    return np.asarray(off - design @ datum)
 
 
 def _rms(values: FloatArray) -> float:
