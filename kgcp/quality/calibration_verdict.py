@@ -13,7 +13,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.network.calibration_records import CameraCalibration, LensModel, PointModel
 from kgcp.network.equations import view_rows, whitened
 from kgcp.network.field_deviation import FieldDeviation, field_deviation
-from kgcp.network.focal_trend import FocalTrend, focal_trend
+from kgcp.network.focal_changes import FocalChanges, FocalStep, FocalTrend, focal_changes
 from kgcp.network.records import PointPrior
 from kgcp.network.sheet_bends import bend_displacements
 from kgcp.network.turned_files import turned_photographs
@@ -32,8 +32,8 @@ _MAX_OPERATOR_RATIO = 3.0  # of a misfit to the standard deviation with which di
 _MAX_BAR_SDS = 3.0  # of a bar's residual
 _MIN_COVERAGE = 0.7
 _MIN_NORMALS_DEG = 15.0  # largest angle between two normals of the field
-_TREND_LEVEL = 0.001  # probability below which a focal length changes with the distance
-_MIN_TREND = 0.0005  # smallest such change, relative to the focal length
+_FOCAL_LEVEL = 0.001  # probability below which a change of the focal length is not by chance
+_MIN_FOCAL_CHANGE = 0.0005  # smallest such change, relative to the focal length
 _MAX_RADIUS_ERROR = 0.03  # relative, of the stated diameters
 # Relative difference of the discs' size in one photograph from that in most, above which it shows
 # another field. Sharpened discs in motion, of 4 px radius, differ by up to 5.5 % (data set ros10).
@@ -81,7 +81,7 @@ class CalibrationNumbers:
     flatness_m: float | None  # RMS of the field's heights; None: taken as stated
     field: FieldDeviation | None  # None: taken as stated
     bending: FieldBending | None  # None: no bending was estimated
-    trend: FocalTrend | None  # None: the photographs cannot tell
+    focal_changes: FocalChanges
     turned: tuple[str, ...]  # photographs whose files were turned by 180° against most others
     light: DiscLight | None  # None: levels are not known
 
@@ -151,7 +151,7 @@ def calibration_numbers(
         if calibration.points_used is PointModel.FIXED
         else field_deviation(calibration.field, calibration.views, estimate.points),
         _field_bending(calibration),
-        focal_trend(calibration.network, calibration.solution, calibration.precision),
+        focal_changes(calibration.network, calibration.solution, calibration.precision),
         turned_photographs(calibration),
         light,
     )
@@ -288,13 +288,18 @@ def _handling_doubts(calibration: CameraCalibration, numbers: CalibrationNumbers
             f"{listed(numbers.turned, _MAX_NAMED)} would fit the others much better if turned"
             " by 180°: the principal point is wrong"
         )
-    if numbers.trend is not None and _is_focus_changing(calibration, numbers):
-        change_px = numbers.trend.change_px
+    change = _focal_change(calibration, numbers)
+    if change is None:
+        return
+    other = f"{abs(change.change_px):.1f} px {'longer' if change.change_px > 0.0 else 'shorter'}"
+    if isinstance(change, FocalTrend):
         yield (
             "the focal length changes with the distance: in the nearest photograph it is"
-            f" {abs(change_px):.1f} px {'longer' if change_px > 0.0 else 'shorter'} than in the"
-            " farthest"
+            f" {other} than in the farthest"
         )
+    else:
+        first = calibration.views[change.first].photo
+        yield f"from {first} on, the focal length is {other} than in the photographs before"
 
 
 def _field_doubts(numbers: CalibrationNumbers) -> Iterator[str]:
@@ -338,12 +343,18 @@ def _fits_badly(numbers: CalibrationNumbers) -> bool:
     return numbers.misfit_px > _MAX_OPERATOR_RATIO * numbers.operator_sd_px
 
 
-def _is_focus_changing(calibration: CameraCalibration, numbers: CalibrationNumbers) -> bool:
-    """Tell whether the focal length changes with the distance, as by autofocus."""
-    if numbers.trend is None:
-        return False
-    least_px = _MIN_TREND * calibration.camera.fx
-    return abs(numbers.trend.change_px) > least_px and numbers.trend.p_value < _TREND_LEVEL
+def _focal_change(
+    calibration: CameraCalibration, numbers: CalibrationNumbers
+) -> FocalTrend | FocalStep | None:
+    """Return the clearest change of the focal length; None: it is not seen to change."""
+    least_px = _MIN_FOCAL_CHANGE * calibration.camera.fx
+    changes = numbers.focal_changes.trend, numbers.focal_changes.step
+    clear = [
+        change
+        for change in changes
+        if change and abs(change.change_px) > least_px and change.p_value < _FOCAL_LEVEL
+    ]
+    return min(clear, key=lambda change: change.p_value, default=None)
 
 
 def _bends_much(numbers: CalibrationNumbers) -> bool:
@@ -404,10 +415,17 @@ def _handling_advice(calibration: CameraCalibration, numbers: CalibrationNumbers
             "Give all photographs as the camera stored them: programs that apply the orientation of"
             " EXIF turn some."
         )
-    if _is_focus_changing(calibration, numbers):
+    change = _focal_change(calibration, numbers)
+    if isinstance(change, FocalTrend):
         yield (
             "Switch the autofocus off, and focus as in the flight: with another focus, the focal"
             " length is another."
+        )
+    if isinstance(change, FocalStep):
+        first = calibration.views[change.first].photo
+        yield (
+            f"Calibrate the photographs before and from {first} on separately, and use those taken"
+            " with the zoom and focus of the flight."
         )
 
 

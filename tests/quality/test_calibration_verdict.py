@@ -27,6 +27,7 @@ from kgcp.network.calibration_records import (
     PointModel,
 )
 from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem, NetworkUnknowns
+from kgcp.network.focal_changes import FocalChanges
 from kgcp.network.photographs_apart import _view_misfits_px
 from kgcp.network.records import CalibrationPrior
 from kgcp.network.sheet_bends import bend_shapes
@@ -361,9 +362,9 @@ def test_a_focal_length_that_changes_with_the_distance_is_reported() -> None:
     result = calibrated(from_two_distances(0.004), PointModel.STIFF, LensModel.AUTO)
     numbers = calibration_numbers(result)
     assert numbers.misfit_px < 3.0 * numbers.operator_sd_px
-    assert numbers.trend is not None
-    assert numbers.trend.lens_m == pytest.approx(0.004, rel=0.25)
-    assert numbers.trend.change_px == pytest.approx(5.0, rel=0.25)
+    assert numbers.focal_changes.trend is not None
+    assert numbers.focal_changes.trend.lens_m == pytest.approx(0.004, rel=0.25)
+    assert numbers.focal_changes.trend.change_px == pytest.approx(5.0, rel=0.25)
     verdict = judge(result, numbers)
     assert verdict.grade is CalibrationGrade.LOOK
     assert "changes with the distance: in the nearest photograph it is" in verdict.sentence
@@ -376,15 +377,37 @@ def test_a_focal_length_that_changes_with_the_distance_is_reported() -> None:
 def test_a_fixed_focal_length_is_not_said_to_change(points: PointModel, noise_px: float) -> None:
     result = calibrated(from_two_distances(0.0, noise_px), points, LensModel.AUTO)
     numbers = calibration_numbers(result)
-    assert numbers.trend is not None
-    assert numbers.trend.p_value > 0.001
-    assert abs(numbers.trend.lens_m) < 0.002
-    assert "changes with the distance" not in judge(result, numbers).sentence
+    assert numbers.focal_changes.trend is not None
+    assert numbers.focal_changes.trend.p_value > 0.001
+    assert abs(numbers.focal_changes.trend.lens_m) < 0.002
+    assert "the focal length" not in judge(result, numbers).sentence
+
+
+def test_a_focal_length_that_changes_during_the_session_is_reported() -> None:
+    """All discs fit, with a focal length between the two: nothing else shows it."""
+    made = []
+    for camera, tilt in ((CAMERA, 0.5), (replace(CAMERA, fx=1503.0, fy=1503.0), 0.6)):
+        near, far = (
+            views(tilt, camera=camera, distance_m=distance_m) for distance_m in (0.31, 0.38)
+        )
+        session = near[:3] + far[3:]
+        made += [replace(view, photo=f"{camera.fx:.0f} {view.photo}") for view in session]
+    result = calibrated(made)
+    assert result.dropped == ()
+    numbers = calibration_numbers(result)
+    assert numbers.focal_changes.step is not None
+    assert numbers.focal_changes.step.change_px == pytest.approx(3.0, rel=0.1)
+    verdict = judge(result, numbers)
+    assert verdict.grade is CalibrationGrade.LOOK
+    assert "from 1503 p0 on, the focal length is" in verdict.sentence
+    assert any(
+        "Calibrate the photographs before and from" in sentence for sentence in verdict.advice
+    )
 
 
 def test_photographs_from_few_places_tell_no_change_of_the_focal_length() -> None:
     result = calibrated(views()[:4])
-    assert calibration_numbers(result).trend is None
+    assert calibration_numbers(result).focal_changes == FocalChanges(None, None)
 
 
 def test_a_photograph_of_another_zoom_is_found_if_another_one_fits_worst() -> None:

@@ -172,6 +172,7 @@ def _summary(
 ) -> dict[str, object]:
     calibration = made.calibration
     camera = calibration.camera
+    trend, step = numbers.focal_changes.trend, numbers.focal_changes.step
     against = {} if comparison is None else {"against": comparison.numbers(camera)}
     return {
         **against,
@@ -212,8 +213,15 @@ def _summary(
                 calibration.field.bars, calibration.bar_residuals_m, strict=True
             )
         ],
-        "focal_change_px": None if numbers.trend is None else numbers.trend.change_px,
-        "focal_change_p": None if numbers.trend is None else numbers.trend.p_value,
+        "focal_change_px": None if trend is None else trend.change_px,
+        "focal_change_p": None if trend is None else trend.p_value,
+        "focal_step": None
+        if step is None
+        else {
+            "first_photo": calibration.views[step.first].photo,
+            "change_px": step.change_px,
+            "p": step.p_value,
+        },
         "bending_m": None if numbers.bending is None else numbers.bending.height_m,
         "bending_px": None if numbers.bending is None else numbers.bending.image_px,
         "change_if_eccentricity_neglected": change_if_neglected(calibration),
