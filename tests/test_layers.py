@@ -152,6 +152,8 @@ def imports(path: Path) -> list[Import]:
             assert node.module is not None
             names = {f"{node.module}.{alias.name}" for alias in node.names} & module_names()
             found.extend(Import(name, is_hidden) for name in names or {node.module})
+        if isinstance(node, ast.expr):  # holds no statement
+            return
         for child in ast.iter_child_nodes(node):
             defers = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.If)
             visit(child, is_hidden=is_hidden or defers)
