@@ -29,8 +29,8 @@ CHANGES = {
     ),
     "response": ([('"linear"', '"unknown"')], "[camera] response (linear → unknown)"),
     "accuracy of the calibration": (
-        [("fx = 1903.0", "fx = 1903.0\nsd_fx = 0.5")],
-        "[camera] sd_fx (none → 0.5)",
+        [("fx = 1903.0", "fx = 1903.0\nsd_fx = 0.5\nsd_fy = 0.4")],
+        "[camera] sd_fx (none → 0.5), [camera] sd_fy (none → 0.4)",
     ),
     "shutter": (
         [('response = "linear"', 'response = "linear"\nreadout_s = 0.001')],

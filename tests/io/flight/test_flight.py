@@ -32,6 +32,7 @@ k6 = 0.001
 response = "linear"
 readout_s = 0.01
 sd_fx = 0.5
+sd_fy = 0.25
 sd_k6 = 2e-4
 plumb_sd_deg = 8
 
@@ -72,6 +73,8 @@ level_sd_deg = 1.5
 [reference]
 poses = "aat.csv"
 """
+
+DEVIATIONS = "sd_fx = 0.5\nsd_fy = 0.25\nsd_k6 = 2e-4"
 
 Write = Callable[[str], Path]
 
@@ -114,21 +117,23 @@ def test_every_value_is_read_into_its_record(write: Write) -> None:
     assert flight.vehicle.settings.time_offset_s == -0.25
     assert (flight.plumb_sd_deg, flight.vehicle.settings.level_sd_deg) == (8.0, 1.5)
     assert flight.calibration_covariance is not None
-    assert np.diag(flight.calibration_covariance.cov) == pytest.approx([0.25, *[0] * 10, 4e-8])
+    assert np.diag(flight.calibration_covariance.cov) == pytest.approx(
+        [0.25, 0.0625, *[0] * 9, 4e-8]
+    )
 
 
 def test_a_covariance_of_the_calibration_is_a_list_row_by_row(write: Write) -> None:
-    deviations = "sd_fx = 0.5\nsd_k6 = 2e-4\n"
-    text = changed(deviations, 'cov_of = ["cy", "fx"]\ncov = [4, 1.5, 1.5, 1]\n')
+    numbers = "[4, 1.5, 0, 1.5, 1, 0.5, 0, 0.5, 9]"
+    text = changed(DEVIATIONS, f'cov_of = ["cy", "fx", "fy"]\ncov = {numbers}')
     covariance = read_flight(write(text)).calibration_covariance
     assert covariance is not None
     assert covariance.cov[:4, :4].tolist() == [
-        [1.0, 0.0, 0.0, 1.5],
-        [0.0, 0.0, 0.0, 0.0],
+        [1.0, 0.5, 0.0, 1.5],
+        [0.5, 9.0, 0.0, 0.0],
         [0.0, 0.0, 0.0, 0.0],
         [1.5, 0.0, 0.0, 4.0],
     ]
-    assert read_flight(write(changed(deviations, ""))).calibration_covariance is None
+    assert read_flight(write(changed(DEVIATIONS, ""))).calibration_covariance is None
 
 
 def test_replicas_belong_to_their_plate(write: Write) -> None:
@@ -202,13 +207,16 @@ def test_optional_keys_have_the_defaults_of_the_folder(tmp_path: Path, write: Wr
         ("0.01, 0.01, 0.02", "0, 0, -1", "post sd_position_m: is negative"),
         ("position_m = [346937.1, 4582508.6, 122]\n", "", "sd_position_m: needs position_m"),
         ("sd_fx = 0.5", "sd_fx = -0.5", r"\[camera\] sd_fx: -0.5 is out of range; give"),
-        ("sd_fx = 0.5", "cov = [1]", r"\[camera\] sd_k6: is given beside cov; delete"),
-        ("sd_fx = 0.5\nsd_k6 = 2e-4", "cov = [1]", r"\[camera\] cov_of: is missing; give"),
-        ("sd_fx = 0.5\nsd_k6 = 2e-4", 'cov_of = ["fx"]', r"\[camera\] cov: is missing; give"),
-        ("sd_fx = 0.5\nsd_k6 = 2e-4", "cov = [1]\ncov_of = [1]", "cov_of: is a number; give a"),
-        ("sd_fx = 0.5\nsd_k6 = 2e-4", 'cov = [1]\ncov_of = "fx"', "cov_of: is a text; give a"),
-        ("sd_fx = 0.5\nsd_k6 = 2e-4", 'cov = [1, 2]\ncov_of = ["fx"]', "cov: has 2 numbers for 1"),
-        ("sd_fx = 0.5\nsd_k6 = 2e-4", 'cov = [-1]\ncov_of = ["fx"]', "cov: is not a covariance"),
+        ("sd_fx = 0.5\nsd_fy = 0.25", "cov = [1]", r"\[camera\] sd_k6: is given beside cov"),
+        (DEVIATIONS, "cov = [1]", r"\[camera\] cov_of: is missing; give"),
+        (DEVIATIONS, 'cov_of = ["fx"]', r"\[camera\] cov: is missing; give"),
+        (DEVIATIONS, "cov = [1]\ncov_of = [1]", "cov_of: is a number; give a"),
+        (DEVIATIONS, 'cov = [1]\ncov_of = "fx"', "cov_of: is a text; give a"),
+        (DEVIATIONS, 'cov = [1, 2]\ncov_of = ["cx"]', "cov: has 2 numbers for 1"),
+        (DEVIATIONS, 'cov = [-1]\ncov_of = ["cx"]', "cov: is not a covariance"),
+        ("sd_fx = 0.5\n", "", r"\[camera\] sd_fx: is missing; state how well fx and fy are known"),
+        ("sd_fy = 0.25\n", "", r"\[camera\] sd_fy: is missing; state"),
+        (DEVIATIONS, 'cov = [1]\ncov_of = ["fy"]', "cov_of: has one of fx and fy; state"),
         ("plumb_sd_deg = 8", "plumb_sd_deg = 80", r"\[camera\] plumb_sd_deg: 80 deg is out of"),
         ("level_sd_deg = 1.5", "level_sd_deg = 0", r"\[vehicle\] level_sd_deg: 0 deg is out of"),
         ("level_sd_deg = 1.5\n", "", r"plumb_sd_deg: needs \[vehicle\] level_sd_deg;"),
@@ -222,7 +230,7 @@ def test_optional_keys_have_the_defaults_of_the_folder(tmp_path: Path, write: Wr
         ('"times.csv"', '"time.csv"', r"\[frames\] times: 'time.csv' does not exist; create"),
         ('"times.csv"', '"pictures"', r"times: 'pictures' is not a regular file; name a file"),
         # syntax
-        ("[reference]", "[reference", r"is not TOML: .*line 57.*; correct that line"),
+        ("[reference]", "[reference", r"is not TOML: .*line 58.*; correct that line"),
         ("fy = 2304\n", "fy = 2304\nfx = 1\n", "is not TOML: .*line 13"),
         ("fy = 2304\n", "fy = 2304,0\n", "is not TOML: line 12, .*; decimals take a point"),
         ("[reference]", "[vehicle]\n[reference]", r"line \d+: \[vehicle\] is given twice; put all"),
