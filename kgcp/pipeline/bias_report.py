@@ -34,7 +34,7 @@ from kgcp.pipeline.execution.signals import defer_interrupts
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.flight_inputs import FlightInputs, naming_causes
 from kgcp.pipeline.frame_priors import motions_while_read
-from kgcp.pipeline.workspace import DETECTIONS, results_folder
+from kgcp.pipeline.workspace import DETECTIONS, require_outside_frames, results_folder
 from kgcp.quality.advice import advice
 from kgcp.quality.bias_study import BiasStudy, study_bias
 from kgcp.quality.checks.doubt import Doubt
@@ -146,10 +146,12 @@ class FlightBias:
         Raises
         ------
         KgcpError
-            If no measurement can be compared, or a file cannot be written.
+            If no measurement can be compared, the folder is among the frames, which its figures
+            would join, or a file cannot be written.
         """
         study, flight = self.study, self.flight
         folder = results_folder(flight.folder) if folder is None else Path(folder)
+        require_outside_frames(flight, folder, "report", option="out")
         if not study.trusted:
             with naming_causes(self.doubts):
                 raise KgcpError(

@@ -17,7 +17,7 @@ from kgcp.io.files.atomic import remove
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.marks import HandMark, read_marks
-from kgcp.io.images.frames import RESULTS_NAME, matching_frames
+from kgcp.io.images.frames import matching_frames
 from kgcp.io.images.remote import StoredFolder, frames_below
 from kgcp.io.tables.columns import Row
 from kgcp.io.tables.detections import DETECTION_COLUMNS, detection_rows
@@ -49,7 +49,7 @@ from kgcp.pipeline.guidance import (
 )
 from kgcp.pipeline.overlay import draw_overlay
 from kgcp.pipeline.run_summary import DetectionSummary, Stopwatch, SummaryBuilder
-from kgcp.pipeline.workspace import DETECTIONS, results_folder
+from kgcp.pipeline.workspace import DETECTIONS, require_outside_frames, results_folder
 from kgcp.report.contact_sheet import ContactSheet
 from kgcp.settings import DetectSettings, require_flag, require_range
 from kgcp.targets.plain import shape_of
@@ -383,14 +383,7 @@ def _marks(
 
 
 def _sheet(flight: Flight, folder: Path) -> ContactSheet:
-    place = folder.resolve()
-    is_result = place.is_relative_to((flight.folder / RESULTS_NAME).resolve())
-    if place.is_relative_to(flight.frames_folder.resolve()) and not is_result:
-        raise KgcpError(
-            f"{folder}: is among the frames, where pictures would be taken for frames;"
-            f" choose another folder of pictures, such as {flight.folder / RESULTS_NAME / 'sheet'}",
-            option="overlay",
-        )
+    require_outside_frames(flight, folder, "sheet", option="overlay")
     return ContactSheet(folder)
 
 

@@ -50,6 +50,29 @@ def results_folder(flight: Path) -> Path:
     return folder
 
 
+def require_outside_frames(flight: Flight, folder: Path, usual: str, *, option: str) -> None:
+    """Refuse a folder of pictures in which these would be taken for frames.
+
+    Parameters
+    ----------
+    usual : str
+        Name of a folder in the results' one that suits, for the message.
+
+    Raises
+    ------
+    KgcpError
+        If it is among the frames, and not in the flight's results folder.
+    """
+    place = folder.resolve()
+    is_result = place.is_relative_to((flight.folder / RESULTS_NAME).resolve())
+    if place.is_relative_to(flight.frames_folder.resolve()) and not is_result:
+        raise KgcpError(
+            f"{folder}: is among the frames, where pictures would be taken for frames;"
+            f" choose another folder of pictures, such as {flight.folder / RESULTS_NAME / usual}",
+            option=option,
+        )
+
+
 @dataclass(frozen=True, slots=True)
 class Workspace:
     """Folders of this machine, and the places in a store that they replace."""

@@ -286,6 +286,17 @@ def test_without_frames_there_is_a_page_too(compare: Compare, study: Study, tmp_
     assert not (tmp_path / "bias_reexposure.png").exists()
 
 
+def test_figures_are_not_written_among_the_frames(
+    compare: Compare, study: Study, tmp_path: Path
+) -> None:
+    """They would be frames, to which the detections do not belong any more."""
+    bias = of_sample(study(compare(30.0, 0.1)))
+    bias = replace(bias, flight=replace(bias.flight, folder=tmp_path, frames_folder=tmp_path))
+    with pytest.raises(KgcpError, match=r"is among the frames.* such as .*report"):
+        bias.write_report(tmp_path / "figures")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_interrupted_report_leaves_that_of_the_run_before(
     compare: Compare, study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
