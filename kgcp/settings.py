@@ -40,6 +40,13 @@ def require_flag(key: str, value: object) -> None:
         raise SettingError(key, f"{value!r} is neither True nor False", "give one of them")
 
 
+def require_kind(key: str, value: object, kind: type, remedy: str = "") -> None:
+    """Raise `SettingError` unless a value is of a kind; the remedy is by default to give one."""
+    if not isinstance(value, kind):
+        remedy = remedy or f"give a kgcp.{kind.__name__}"
+        raise SettingError(key, f"is a {type(value).__name__}", remedy)
+
+
 def require_word(key: str, value: str, words: type[WordT]) -> WordT:
     """Return the word that a value is, or raise `SettingError` if it is none of them."""
     try:

@@ -28,9 +28,16 @@ CAMERA = kgcp.Camera(640, 480, 800.0, 800.0, 320.0, 240.0)
 untyped_settings: Any = kgcp.DetectSettings
 untyped_replace: Any = replace
 untyped_measure: Any = kgcp.measure_frame
+untyped_check: Any = kgcp.check_flight
+untyped_detect: Any = kgcp.detect_flight
+untyped_make: Any = kgcp.make_gcps
+untyped_study: Any = kgcp.bias_study
+untyped_export: Any = kgcp.export_gcps
 untyped_options: Any = kgcp.RunOptions
 untyped_selection: Any = kgcp.Selection
+untyped_points: Any = MapPoints
 FRAME = np.zeros((480, 640), np.uint8)
+SAMPLE = kgcp.read_flight(ROOT / "sample_flight")
 
 
 def test_every_public_name_is_there_and_described() -> None:
@@ -150,6 +157,17 @@ def test_the_method_is_taken_as_a_word() -> None:
         (
             lambda: untyped_measure(FRAME, CAMERA, [kgcp.Target(RING)], {"method": "paper"}),
             "settings: is a dict; give a kgcp.DetectSettings",
+        ),
+        (lambda: untyped_check("s"), r"flight: is a str; give kgcp.read_flight\(folder\)"),
+        (lambda: untyped_detect("s"), "flight: is a str; give"),
+        (lambda: untyped_make("s"), "flight: is a str; give"),
+        (lambda: untyped_study("s"), "flight: is a str; give"),
+        (lambda: untyped_detect(SAMPLE, "results"), "settings: is a str; give a kgcp.DetectSett"),
+        (lambda: untyped_detect(SAMPLE, options=2), "options: is a int; give a kgcp.RunOptions"),
+        (lambda: untyped_export(None, "odm"), "formats: is the text 'odm'; give a list of names"),
+        (
+            lambda: untyped_points("EPSG:25832", (), CAMERA, image_extensions="no"),
+            "image_extensions: 'no' is neither True nor False",
         ),
         (lambda: untyped_replace(RING, code_deg=43), "code_deg: 43 is not a list"),
         (lambda: untyped_replace(CAMERA, k1="0.1"), "k1: is not a finite number"),

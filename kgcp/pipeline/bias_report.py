@@ -16,7 +16,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.io.files.atomic import remove, write_bytes
 from kgcp.io.flight.data import FlightData
-from kgcp.io.flight.flight import Flight
+from kgcp.io.flight.flight import Flight, require_flight
 from kgcp.io.images.frames import read_grey
 from kgcp.io.images.remote import StoredFolder, at_hand
 from kgcp.io.tables.detections import (
@@ -215,6 +215,7 @@ def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBi
     KgcpError
         If flight.toml names no reference poses, or a file is missing or unreadable.
     """
+    require_flight(flight)
     table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
     attempts = read_attempts(table, flight)
     settings = read_settings(table)

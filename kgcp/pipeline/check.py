@@ -9,7 +9,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.io.flight.flight import Flight
+from kgcp.io.flight.flight import Flight, require_flight
 from kgcp.io.images.frames import matching_frames
 from kgcp.io.images.remote import StoredFolder, frames_below
 from kgcp.pipeline.execution.threads import single_threaded
@@ -61,6 +61,7 @@ def check_flight(flight: Flight, *, stored_frames: StoredFolder | None = None) -
     KgcpError
         If there are no frames. Other missing or wrong files are reported as doubts.
     """
+    require_flight(flight)
     inputs = FlightInputs.of(
         flight, frames_below(stored_frames or flight.frames_folder), stored_frames
     )

@@ -15,7 +15,7 @@ from pathlib import Path
 from kgcp.errors import KgcpError, SettingError
 from kgcp.io.files.atomic import remove
 from kgcp.io.flight.data import FlightData
-from kgcp.io.flight.flight import Flight
+from kgcp.io.flight.flight import Flight, require_flight
 from kgcp.io.formats.marks import HandMark, read_marks
 from kgcp.io.images.frames import matching_frames
 from kgcp.io.images.remote import StoredFolder, frames_below
@@ -51,7 +51,7 @@ from kgcp.pipeline.overlay import draw_overlay
 from kgcp.pipeline.run_summary import DetectionSummary, Stopwatch, SummaryBuilder
 from kgcp.pipeline.workspace import DETECTIONS, require_outside_frames, results_folder
 from kgcp.report.contact_sheet import ContactSheet
-from kgcp.settings import DetectSettings, require_flag, require_range
+from kgcp.settings import DetectSettings, require_flag, require_kind, require_range
 from kgcp.targets.plain import shape_of
 
 
@@ -168,6 +168,9 @@ def detect_flight(
         reference poses is invalid, `out` cannot be written or is in use by another process, the
         scheduler cannot be used, or frames change or disappear.
     """
+    require_flight(flight)
+    require_kind("settings", settings, DetectSettings)
+    require_kind("options", options, RunOptions)
     stopwatch = Stopwatch()
     out = results_folder(flight.folder) if out is None else Path(out)
     if options.scheduler is not None:

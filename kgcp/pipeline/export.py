@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from kgcp.errors import KgcpError
+from kgcp.errors import KgcpError, SettingError
 from kgcp.georef.camera_priors import CameraPrior, camera_priors
 from kgcp.georef.gcp import Gcp, SkippedSighting, SkipReason, build_gcps, transform_gcps
 from kgcp.georef.local_frame import CrsTransform
@@ -21,7 +21,7 @@ from kgcp.io.exporters.points import MapPoints
 from kgcp.io.exporters.weights import MARK_FLOOR_PX
 from kgcp.io.exporters.write import export
 from kgcp.io.flight.data import FlightData
-from kgcp.io.flight.flight import Flight
+from kgcp.io.flight.flight import Flight, require_flight
 from kgcp.io.tables.consistency import remove_consistency, write_consistency
 from kgcp.io.tables.detections import read_attempts
 from kgcp.io.tables.gcps import GCP_COLUMNS, gcp_row
@@ -104,6 +104,7 @@ def make_gcps(
         If nothing was measured, no position can be computed, a file is unreadable, or a CRS is
         unusable.
     """
+    require_flight(flight)
     table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
     attempts = read_attempts(table, flight)
     sightings, excluded = _sightings(table, attempts, selection)
@@ -206,6 +207,8 @@ def export_gcps(
         If a format is unknown or cannot hold the points, there are none, or a file cannot be
         written.
     """
+    if isinstance(formats, str):
+        raise SettingError("formats", f"is the text {formats!r}", "give a list of names")
     folder = results_folder(gcp_set.flight.folder) if folder is None else Path(folder)
     points = MapPoints(
         gcp_set.crs,

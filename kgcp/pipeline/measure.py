@@ -12,7 +12,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.measurement.frame import examine
 from kgcp.measurement.records import Outcome
 from kgcp.pipeline.execution.threads import single_threaded
-from kgcp.settings import DetectSettings
+from kgcp.settings import DetectSettings, require_kind
 from kgcp.targets.layout import Target
 from kgcp.targets.validation import check_targets
 
@@ -46,9 +46,8 @@ def measure_frame(
         If the array is not one grey frame of the camera's size, or the targets cannot be told
         apart.
     """
-    for key, value, kind in (("camera", camera, Camera), ("settings", settings, DetectSettings)):
-        if not isinstance(value, kind):
-            raise KgcpError(f"{key}: is a {type(value).__name__}; give a kgcp.{kind.__name__}")
+    require_kind("camera", camera, Camera)
+    require_kind("settings", settings, DetectSettings)
     _check_frame(grey, camera)
     if isinstance(targets, Target):
         raise KgcpError("targets: is a single Target; give a list of them")

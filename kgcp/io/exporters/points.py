@@ -21,7 +21,7 @@ from kgcp.georef.crs import is_geographic
 from kgcp.georef.gcp import Gcp
 from kgcp.io.exporters.weights import MARK_FLOOR_PX
 from kgcp.io.files.csv_text import DEGREE_DECIMALS
-from kgcp.settings import require_range
+from kgcp.settings import require_flag, require_range
 
 Cell = TypeVar("Cell", str, float)
 
@@ -51,6 +51,7 @@ class MapPoints:
 
     def __post_init__(self) -> None:
         require_range("mark_floor_px", self.mark_floor_px, 0.0, 100.0, unit="px")
+        require_flag("image_extensions", self.image_extensions)
 
     @property
     def parsed_crs(self) -> CRS:

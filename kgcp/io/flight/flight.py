@@ -24,6 +24,7 @@ from kgcp.io.flight.vehicle_table import VehicleTable, read_vehicle
 from kgcp.io.formats.frame_times import FORMATS as TIMES_FORMATS
 from kgcp.io.formats.orientations import FORMATS as POSE_FORMATS
 from kgcp.io.formats.orientations.records import OrientationFileOptions
+from kgcp.settings import require_kind
 from kgcp.targets.layout import Target
 from kgcp.targets.plain import AnyTarget, PlainTarget
 
@@ -134,6 +135,16 @@ def read_flight(folder: Path | str) -> Flight:
         reference=_read_reference(table, folder),
         toml_text=text,
     )
+
+
+def require_flight(flight: object) -> None:
+    """Refuse what is no flight; programs give its folder instead.
+
+    Raises
+    ------
+    SettingError
+    """
+    require_kind("flight", flight, Flight, "give kgcp.read_flight(folder)")
 
 
 def read_printed_targets(folder: Path) -> tuple[Target, ...]:
