@@ -46,11 +46,8 @@ def read_targets(flight: TomlTable, folder: Path) -> tuple[Target, ...]:
     written = flight.tables("target")
     if len(written) > _MOST_TARGETS:
         raise flight.error("target", f"has {len(written)} tables", f"give at most {_MOST_TARGETS}")
-    tables = [
-        _target_table(flight, index, values)
-        for index, values in enumerate(written, start=1)
-        if not _is_plain(values)
-    ]
+    every = [_target_table(flight, index, values) for index, values in enumerate(written, start=1)]
+    tables = [table for table in every if not _is_plain(table.values)]
     plates = [table for table in tables if "replica_of" not in table]
     replicas = [table for table in tables if "replica_of" in table]
     names = [table.name("name") for table in plates]
@@ -98,6 +95,8 @@ def _target_table(flight: TomlTable, index: int, values: Mapping[str, object]) -
     """Return a [[target]] table, called by its name or, failing that, by its place."""
     name = values.get("name")
     where = f"{flight.where} [[target]] {name if isinstance(name, str) else index}"
+    if "shape" in values:  # which decides what the other keys are
+        TomlTable(where, {"shape": values["shape"]}, ("shape",)).choice("shape", Shape)
     keys = REPLICA_KEYS if "replica_of" in values else PLATE_KEYS
     return TomlTable(where, values, PLAIN_KEYS if _is_plain(values) else keys)
 
