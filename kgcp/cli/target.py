@@ -157,9 +157,9 @@ def command(
     from kgcp.targets.code_design import chosen_targets, new_targets
     from kgcp.targets.sheets import Paper, lay_out
 
+    source = click.get_current_context().get_parameter_source("dots")
+    has_dots = source is not ParameterSource.DEFAULT
     if field_text is not None:
-        source = click.get_current_context().get_parameter_source("dots")
-        has_dots = source is not ParameterSource.DEFAULT
         given = {
             "FLIGHT": flight,
             "--target": names,
@@ -192,6 +192,8 @@ def command(
         raise SettingError("target", "cannot be combined with --new or --code", "give one of them")
     if diameter_m is not None and not is_new:
         raise SettingError("diameter", "applies to new targets only", "add --new or --code")
+    if has_dots and new_count is None:
+        raise SettingError("dots", "applies to proposed codes only", "add --new, or leave it out")
     if (is_round or hole_mm is not None) and plate_m is None:
         raise SettingError("plate", "is required by --round and --holes", "give its width")
     if flight is None and not is_new:

@@ -133,6 +133,7 @@ def test_codes_with_a_rotational_symmetry_cause_a_warning(flight: Path) -> None:
         (["FLIGHT", "--format", "png", "--dpi", "2400", "--plate", "0.5"], "million pixels"),
         (["FLIGHT", "--target", "A", "--new", "1"], "target: cannot be combined with --new"),
         (["FLIGHT", "--diameter", "0.3"], "diameter: applies to new targets only"),
+        (["--code", "0,43,78,180", "--dots", "5"], "dots: applies to proposed codes only"),
         (["no_such_folder"], "flight.toml: does not exist"),
     ],
 )
