@@ -62,6 +62,18 @@ def test_no_file_has_merge_conflict_markers() -> None:
     assert (found.returncode, found.stdout, found.stderr) == (1, "", "")
 
 
+def test_no_line_of_a_paragraph_begins_with_a_mark_of_markdown() -> None:
+    """Such as the > of a menu, where lines were folded: the rest becomes a quotation or a list."""
+    mark = re.compile(r"(?:[-+*>]|#{1,6}|\d+[.)]) ")
+    for page in (*PAGES, ROOT / "benchmarks" / "README.md"):
+        text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+        before = ""
+        for line in text.splitlines():
+            is_text = before.strip() != "" and before[0] != " " and not mark.match(before)
+            assert not (is_text and mark.match(line)), f"{page.name}: {line}"
+            before = line
+
+
 def section(heading: str, page: str = TABLES) -> str:
     """The text below a heading of a page, up to the next one of any level."""
     match = re.search(rf"^#+ {re.escape(heading)}$(.*?)(?=^#|\Z)", page, re.MULTILINE | re.DOTALL)
