@@ -9,6 +9,7 @@ import click
 
 from kgcp.cli.detect_log import log_to_stderr, stopping
 from kgcp.cli.options import (
+    LocalPath,
     json_option,
     log_json_option,
     photo_paths,
@@ -44,7 +45,7 @@ FORMATS = ("opencv", "ros", "metashape", "colmap", "opensfm", "pix4d", "opf", "m
 @click.option(
     "--out",
     metavar="FOLDER",
-    type=click.Path(file_okay=False, path_type=Path),
+    type=LocalPath(file_okay=False),
     default=Path("calibration"),
     show_default=True,
     help="Folder for the results.",
@@ -97,7 +98,7 @@ FORMATS = ("opencv", "ros", "metashape", "colmap", "opensfm", "pix4d", "opf", "m
 @click.option(
     "--against",
     metavar="FILE",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    type=LocalPath(exists=True, dir_okay=False),
     help="Compare with another calibration of the camera: a camera.toml, or a file of OpenCV, ROS,"
     " Metashape, COLMAP, OpenSfM, Pix4D, OPF or MMVII.",
 )

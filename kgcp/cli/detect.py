@@ -11,6 +11,7 @@ import click
 from kgcp.cli import STARTED_S
 from kgcp.cli.detect_log import log_to_stderr, report, report_stages, stopping
 from kgcp.cli.options import (
+    LocalPath,
     NumberRange,
     flight_place_argument,
     json_option,
@@ -91,14 +92,14 @@ _DEFAULTS = DetectSettings()
 )
 @click.option(
     "--places",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=LocalPath(dir_okay=False),
     metavar="FILE",
     help="Places marked by hand, by which plain discs and rings are found in frames without a pose:"
     " CSV with frame,target,x_px,y_px and at least two static targets per frame.",
 )
 @click.option(
     "--overlay",
-    type=click.Path(file_okay=False, path_type=Path),
+    type=LocalPath(file_okay=False),
     metavar="DIR",
     help="Write a contact sheet to DIR/index.html: every ring with its fitted contours, residuals"
     " and values.",

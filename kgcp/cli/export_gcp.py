@@ -12,6 +12,7 @@ import click
 
 from kgcp.cli.doubts import doubt_json, print_doubts
 from kgcp.cli.options import (
+    LocalPath,
     NumberRange,
     detections_option,
     flight_places_argument,
@@ -90,7 +91,7 @@ def _list_formats(context: click.Context, _: click.Parameter, asked: bool) -> No
     "--exclude",
     "exclude_files",
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=LocalPath(),
     multiple=True,
     help="Leave out the frames that this file lists, one per line, or single targets in them"
     " (frame,target), as the contact sheet of 'kgcp detect --overlay' writes it; may be repeated.",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from kgcp.cli.options import NumberRange, flight_argument, json_option
+from kgcp.cli.options import LocalPath, NumberRange, flight_argument, json_option
 
 if TYPE_CHECKING:
     from kgcp.pipeline.init import FlightDraft
@@ -22,7 +22,7 @@ _WIDTH = 100
     "--target",
     "targets_file",
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=LocalPath(),
     help="Take the targets from this targets.toml of 'kgcp target', or from another flight.toml."
     "  [default: a targets.toml in FLIGHT]",
 )

@@ -39,6 +39,26 @@ if TYPE_CHECKING:
     from kgcp.io.images.remote import StoredFolder
 
 
+class LocalPath(click.Path):
+    """A path of this machine: a URL would silently become folders of such names."""
+
+    def __init__(
+        self, *, exists: bool = False, file_okay: bool = True, dir_okay: bool = True
+    ) -> None:
+        super().__init__(exists=exists, file_okay=file_okay, dir_okay=dir_okay, path_type=Path)
+
+    def convert(
+        self,
+        value: Any,  # noqa: ANN401 - click's signature
+        param: click.Parameter | None,
+        ctx: click.Context | None,
+    ) -> Any:  # noqa: ANN401
+        """Return the path of a text, or end with wrong usage."""
+        if "://" in str(value):
+            self.fail(f"{value} is a URL; name a file or folder of this machine.", param, ctx)
+        return super().convert(value, param, ctx)
+
+
 def _place(
     context: click.Context,  # noqa: ARG001 - click's signature
     parameter: click.Parameter,  # noqa: ARG001
@@ -76,9 +96,7 @@ def photo_paths(
     return tuple(path for value in values for path in paths_of(value))
 
 
-flight_argument = click.argument(
-    "flight", metavar="[FLIGHT]", type=click.Path(path_type=Path), default="."
-)
+flight_argument = click.argument("flight", metavar="[FLIGHT]", type=LocalPath(), default=".")
 
 flight_place_argument = click.argument("flight", metavar="[FLIGHT]", callback=_place, default=".")
 
@@ -96,7 +114,7 @@ out_place_option = click.option(
 detections_option = click.option(
     "--detections",
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=LocalPath(),
     help="Table written by 'kgcp detect'.  [default: detections.parquet in the results' folder]",
 )
 

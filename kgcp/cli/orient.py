@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from kgcp.cli.options import (
+    LocalPath,
     detections_option,
     flight_place_argument,
     json_option,
@@ -52,7 +53,7 @@ _MAX_NAMED = 3  # frames in a message
     "--device",
     "device_file",
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=LocalPath(),
     help="Orient frames by an EO device that they show, relative to it; FILE, device.toml, has its"
     " points.",
 )

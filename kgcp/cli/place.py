@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from kgcp.cli.options import detections_option, flight_place_argument, json_option, out_place_option
+from kgcp.cli.options import (
+    LocalPath,
+    detections_option,
+    flight_place_argument,
+    json_option,
+    out_place_option,
+)
 from kgcp.io.exporters.formats import FORMATS, OF_CAMERAS
 
 if TYPE_CHECKING:
@@ -37,7 +43,7 @@ def _names(
 @click.option(
     "--poses",
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=LocalPath(),
     help="Poses of the camera, in any format of [reference].  [default: that of flight.toml]",
 )
 @click.option(

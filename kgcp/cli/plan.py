@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from kgcp.cli.options import flight_argument
+from kgcp.cli.options import LocalPath, flight_argument
 
 if TYPE_CHECKING:
     from kgcp.simulation.outlook import Conditions, Outlook
@@ -58,7 +58,7 @@ def _condition(
 @click.option(
     "--plot",
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=LocalPath(),
     help="Plot the table to FILE, as .png or .svg.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of the table.")

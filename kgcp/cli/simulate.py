@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from kgcp.cli.options import NumberRange, json_option
+from kgcp.cli.options import LocalPath, NumberRange, json_option
 
 if TYPE_CHECKING:
     from kgcp.simulation.presets import SimulationSettings
@@ -21,7 +21,7 @@ PRESET_NAMES = (
 
 
 @click.command()
-@click.argument("out", type=click.Path(path_type=Path))
+@click.argument("out", type=LocalPath())
 @click.option(
     "--preset",
     "preset_name",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 from click.core import ParameterSource
 
-from kgcp.cli.options import NumberRange, json_option, unit_option
+from kgcp.cli.options import LocalPath, NumberRange, json_option, unit_option
 
 if TYPE_CHECKING:
     from kgcp.targets.layout import Target
@@ -21,7 +21,7 @@ PAPERS = ("fit", "A4", "A3", "A2", "A1", "A0")
 
 
 @click.command()
-@click.argument("flight", metavar="[FLIGHT]", type=click.Path(path_type=Path), required=False)
+@click.argument("flight", metavar="[FLIGHT]", type=LocalPath(), required=False)
 @click.option(
     "--target",
     "names",
@@ -109,7 +109,7 @@ PAPERS = ("fit", "A4", "A3", "A2", "A1", "A0")
 @click.option(
     "--out",
     metavar="FOLDER",
-    type=click.Path(path_type=Path),
+    type=LocalPath(),
     help="Folder for the files.  [default: FLIGHT/kgcp/targets, or targets without FLIGHT]",
 )
 @json_option

@@ -132,6 +132,17 @@ def test_nan_as_the_value_of_an_option_is_wrong_usage(
     assert result.exit_code == 2
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [["detect", str(SAMPLE), "--overlay", "s3://b/sheet"], ["simulate", "s3://b/flight"]],
+)
+def test_a_url_is_no_path_of_this_machine(arguments: list[str]) -> None:
+    """It would become local folders `s3:/b`."""
+    result = CliRunner().invoke(main, [*arguments, "--frames", "1"])
+    assert result.exit_code == 2
+    assert f"{arguments[-1]} is a URL; name a file or folder of this machine" in result.stderr
+
+
 def test_an_error_names_an_option_with_hyphens_between_its_words(tmp_path: Path) -> None:
     result = CliRunner().invoke(main, ["detect", str(tmp_path), "--jobs", "0", "--min-score", "2"])
     assert result.stderr.startswith("kgcp: error: --min-score: 2 is out of range; ")
