@@ -28,9 +28,8 @@ OWN_FORMAT = "kgcp"
 """Of a camera.toml, as `kgcp calibrate` writes it."""
 OWN_KEYS = ("width", "height", *CALIBRATION_PARAMETERS, "response", "cov_of", "cov")
 _FORMATS = (OWN_FORMAT, *FORMATS.names)
-# A ring's distance follows from the direction in which its image is longest, so that one exact
-# principal distance would make some distances of a flight seem exact.
-_BOTH = "state how well fx and fy are known, both: without one of them, it would count as exact"
+# Distances follow from them; a ring's from the one along which its image is longest.
+_BOTH = "state how well fx and fy are known, both: what is not stated counts as exact"
 
 
 def read_camera(table: TomlTable, folder: Path) -> Camera:
@@ -118,15 +117,15 @@ def read_calibration_covariance(table: TomlTable, folder: Path) -> CalibrationCo
     ------
     KgcpError
         Naming file, key and remedy: for negative deviations, a matrix that is not a
-        covariance, both of them, or the accuracy of only one principal distance.
+        covariance, both of them, or none of the principal distances.
     """
     deviations = [key for key in DEVIATION_KEYS if key in table]
     if "cov" in table or "cov_of" in table:
         if deviations:
             raise table.error(deviations[0], "is given beside cov", "delete one of the two")
         numbers, names = np.array(table.numbers("cov")), table.texts("cov_of")
-        if ("fx" in names) != ("fy" in names):
-            raise table.error("cov_of", "has one of fx and fy", _BOTH)
+        if not {"fx", "fy"} <= {*names}:
+            raise table.error("cov_of", "lacks fx or fy", _BOTH)
         size = len(names)
         cov = numbers.reshape(size, size) if numbers.size == size * size else numbers
         with table.located():
@@ -134,9 +133,9 @@ def read_calibration_covariance(table: TomlTable, folder: Path) -> CalibrationCo
     if not deviations:
         own = _own_table(table, folder)
         return None if own is None else read_calibration_covariance(own, folder)
-    if ("sd_fx" in table) != ("sd_fy" in table):
-        absent = "sd_fy" if "sd_fx" in table else "sd_fx"
-        raise table.error(absent, "is missing", _BOTH)
+    for key in ("sd_fx", "sd_fy"):
+        if key not in table:
+            raise table.error(key, "is missing", _BOTH)
     sd = np.array([table.number(key) for key in deviations])
     with table.located():
         for key, value in zip(deviations, sd, strict=True):
