@@ -106,7 +106,7 @@ class CalibrationOptions:
     jobs : int or None
         Number of worker processes; 0: this process; None: the number of cores.
     photo_timeout_s : float
-        Time limit for one look at one photograph [s].
+        Time limit for one look at one photograph, and for learning the camera from five [s].
     is_restart : bool
         Whether to start over instead of resuming an interrupted run.
     """
@@ -115,7 +115,7 @@ class CalibrationOptions:
     response: Response = Response.UNKNOWN
     operator: Operator = Operator.MODEL
     jobs: int | None = None
-    photo_timeout_s: float = 300.0
+    photo_timeout_s: float = 1800.0  # the longest learning that was seen took 310 s
     is_restart: bool = False
 
 
