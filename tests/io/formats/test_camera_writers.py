@@ -159,7 +159,7 @@ def test_opensfm_overrides_all_cameras() -> None:
 
 def test_camera_toml_contains_the_covariance(tmp_path: Path) -> None:
     camera = replace(CAMERA, response=Response.SRGB)
-    known = CalibrationCovariance(covariance(("fx", "cx", "cy", "k1", "k3")))
+    known = CalibrationCovariance(covariance(("fx", "fy", "cx", "cy", "k1", "k3")))
     path = tmp_path / "camera.toml"
     path.write_text(camera_toml(camera, known), encoding="utf-8")
     read, read_covariance = read_camera_file(path)
