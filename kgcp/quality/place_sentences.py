@@ -15,7 +15,7 @@ from kgcp.quality.number_text import minus, rounded
 
 _MAX_RATIO = 3.0  # of a diameter's residual to its standard deviation
 _MAX_CHI2 = 14.2  # of three coordinates, as likely as 3 standard deviations of one
-_ALIKE_SHARE = 0.2  # of their error, by which diameters differ that are all wrong alike
+_ALIKE_SHARE = 0.2  # largest difference between errors that count as one, as a share of it
 _MIN_NOISE_PX = 0.005  # of additional noise that is reported
 
 

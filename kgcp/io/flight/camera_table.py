@@ -117,7 +117,7 @@ def read_calibration_covariance(table: TomlTable, folder: Path) -> CalibrationCo
     ------
     KgcpError
         Naming file, key and remedy: for negative deviations, a matrix that is not a
-        covariance, both of them, or none of the principal distances.
+        covariance, both of them, or accuracies without those of both fx and fy.
     """
     deviations = [key for key in DEVIATION_KEYS if key in table]
     if "cov" in table or "cov_of" in table:

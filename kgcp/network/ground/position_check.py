@@ -131,8 +131,8 @@ def wrong_input(
 
 def _wrong_position(equations: _Equations, names: Sequence[str]) -> WrongPosition | None:
     """Return the position that the frames contradict most; None: none is doubtful."""
-    at, prior = equations.positions, equations.prior_m2
-    normal, right = equations.normal[at, at], equations.right[at]
+    places, prior = equations.positions, equations.prior_m2
+    normal, right = equations.normal[places, places], equations.right[places]
     # residuals that no corrections explain scale the noise of the images, but not the prior
     factor = equations.noise_factor(len(normal))
     gain = np.linalg.solve(np.eye(len(normal)) + prior @ (normal / factor), prior)

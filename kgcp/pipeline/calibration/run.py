@@ -48,6 +48,9 @@ from kgcp.targets.fields.points import AnyField
 
 _LOSSES = {TaskFailure.CRASHED: Reason.WORKER_DIED, TaskFailure.TIMED_OUT: Reason.TIMED_OUT}
 LEARNED_FROM = 5  # photographs from which the camera's tone curve and processing are learned
+# Time limit for one look at a photograph, and for learning the camera from five [s]. The longest
+# learning that was seen took 310 s, and the speed of the machine must not decide on results.
+_CALL_LIMIT_S = 1800.0
 _DIGITS = re.compile(r"(\d+)")
 
 OTHER_SIZE = "other_size"
@@ -105,8 +108,6 @@ class CalibrationOptions:
         Method of measuring discs.
     jobs : int or None
         Number of worker processes; 0: this process; None: the number of cores.
-    photo_timeout_s : float
-        Time limit for one look at one photograph, and for learning the camera from five [s].
     is_restart : bool
         Whether to start over instead of resuming an interrupted run.
     """
@@ -115,7 +116,6 @@ class CalibrationOptions:
     response: Response = Response.UNKNOWN
     operator: Operator = Operator.MODEL
     jobs: int | None = None
-    photo_timeout_s: float = 1800.0  # the longest learning that was seen took 310 s
     is_restart: bool = False
 
 
@@ -224,7 +224,7 @@ def _calibrated(
     listener: ProgressListener,
 ) -> PhotoCalibration:
     task = PhotoTask(field, options.response, options.operator)
-    with open_pool(options.jobs, options.photo_timeout_s, None, out) as pool:
+    with open_pool(options.jobs, _CALL_LIMIT_S, None, out) as pool:
         task = replace(task, camera=_camera_of(pool, task, photos))
         looks = _Looks(journal, pool, listener, task.camera)
         first = looks.through(

@@ -33,7 +33,7 @@ from kgcp.network.ground.position_check import WrongCamera, WrongPosition, wrong
 from kgcp.network.ground.resection import MIN_POINTS
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
-from kgcp.quality.number_text import listed, rounded
+from kgcp.quality.number_text import amount, listed, rounded
 
 _SIGNIFICANT_SIGMAS = 3.0  # a larger common scale of the distances is reported
 _MIN_SCALE = 1e-4  # of the distances, that is reported; no print or survey is better
@@ -71,7 +71,7 @@ class FlightPoses:
     local_frame : LocalFrame
     provenance : mapping of str
         The metadata of the table.
-    wrong : WrongPosition or WrongCamera or None
+    wrong_input : WrongPosition or WrongCamera or None
         What the images contradict: a position, or the calibration; None: neither.
     """
 
@@ -79,7 +79,7 @@ class FlightPoses:
     poses: tuple[FramePose, ...]
     local_frame: LocalFrame
     provenance: Mapping[str, str]
-    wrong: WrongPosition | WrongCamera | None = None
+    wrong_input: WrongPosition | WrongCamera | None = None
 
     @property
     def oriented(self) -> tuple[FramePose, ...]:
@@ -131,8 +131,8 @@ class FlightPoses:
                 f"only {oriented} of {len(enough)} frames with {MIN_POINTS} targets or more could"
                 " be oriented by them; look at position_m and at the names of the targets"
             )
-        if self.wrong is not None:
-            doubts.append(self._contradiction(self.wrong))
+        if self.wrong_input is not None:
+            doubts.append(self._contradiction(self.wrong_input))
         if self.distance_scale is not None:
             share, sd = self.distance_scale
             if abs(share) > max(_MIN_SCALE, _SIGNIFICANT_SIGMAS * sd):
@@ -162,10 +162,8 @@ class FlightPoses:
                 " than is stated"
             )
         fitting = [
-            f"{name} = {value:.{digits}f} ± {sd:.{digits}f} instead of"
-            f" {getattr(self.flight.camera, name):.{digits}f}"
+            f"{name} = {amount(value, sd)} instead of {getattr(self.flight.camera, name):g}"
             for name, (value, sd) in wrong.parameters.items()
-            for digits in [max(0, 1 - math.floor(math.log10(sd)))]
         ]
         return (
             "the images contradict the camera's calibration"
