@@ -277,12 +277,12 @@ def set_checkpoints(gcps: Sequence[Gcp], local_frame: LocalFrame, share: float) 
 
     The track is cut into as many equal pieces, and the point nearest to the middle of each becomes
     a check point. The first and the last point stay control points, because nothing beyond them
-    would control the ends.
+    would control the ends. A share above zero makes at least one of the others a check point.
     """
     along = distances_along_track_m(gcps, local_frame)
     inner = sorted(along, key=along.__getitem__)[1:-1]
-    count = min(round(share * len(along)), len(inner))
-    if not count:
+    count = min(max(round(share * len(along)), 1), len(inner))
+    if not share or not count:
         return tuple(gcps)
     length = max(along.values())
     unused = np.array([along[index] for index in inner])

@@ -144,7 +144,8 @@ def test_a_second_pass_of_the_same_road_is_not_thinned_away() -> None:
 
 
 @pytest.mark.parametrize(
-    ("count", "share", "expected"), [(20, 0.25, 5), (20, 0.0, 0), (3, 1.0, 1), (2, 0.5, 0)]
+    ("count", "share", "expected"),
+    [(20, 0.25, 5), (20, 0.0, 0), (20, 0.01, 1), (3, 1.0, 1), (2, 0.5, 0)],
 )
 def test_checkpoints_are_spread_evenly_and_never_at_the_ends(
     count: int, share: float, expected: int
