@@ -42,12 +42,17 @@ def read_camera(table: TomlTable, folder: Path) -> Camera:
     """
     response = table.optional("response", lambda key: table.choice(key, Response))
     moment = table.optional("time_reference", lambda key: table.choice(key, TimeReference))
+    readout_s = table.number("readout_s", 0.0)
+    if "motion_sd_deg_s" in table and not readout_s:
+        raise table.error(
+            "motion_sd_deg_s", "has no effect without readout_s", "add readout_s, or delete it"
+        )
     camera = _file_camera(table, folder) if "file" in table else _inline_camera(table)
     with table.located():
         return replace(
             camera,
             response=response or camera.response,
-            readout_s=table.number("readout_s", 0.0),
+            readout_s=readout_s,
             motion_sd_deg_s=table.number("motion_sd_deg_s", camera.motion_sd_deg_s),
             time_reference=moment or TimeReference.MIDDLE,
         )
