@@ -366,7 +366,8 @@ class CalibrationProblem:
             state.camera, observed_circles(self.field, state.estimate, observed)
         ).moments
         measured = np.concatenate([view.vectors for view in self.views])
-        usable = np.all(np.isfinite(expected), axis=1) & state.solution.is_used
+        # the distortion of a hopeless adjustment may fold an outline, which then has no such radius
+        usable = (_determinant(expected) > 0.0) & state.solution.is_used
         ratios = np.full(len(measured), np.nan)
         ratios[usable] = (_determinant(measured[usable]) / _determinant(expected[usable])) ** 0.25
         return ratios
