@@ -12,6 +12,10 @@ from kgcp.quality.number_text import amount
 
 _MAX_VARIANCE_FACTOR = 2.0  # after corrections that explain a disagreement
 _AXES = {"forward": 0, "right": 1, "down": 2}
+_LIKE_DOWN = (
+    "wrong heights of trajectory or reference poses look the same, and so do wrong fx, fy or"
+    " diameters if all distances are similar"
+)
 
 
 def advice(consistency: Consistency) -> tuple[str, ...]:
@@ -27,8 +31,9 @@ def advice(consistency: Consistency) -> tuple[str, ...]:
     ratio = math.sqrt(consistency.estimate.variance_factor)
     line = (
         f"vehicle and camera differ by {along:.3f} m along, {across:.3f} m across and {up:.3f} m up"
-        " (RMS), and no correction of lever arm, time, readout or boresight explains it: even"
-        f" after corrections, residuals are {ratio:.1f} times their standard deviations"
+        " (RMS), and no correction of lever arm, time, readout, boresight, diameter or focal length"
+        " explains it:"
+        f" even after corrections, residuals are {ratio:.1f} times their standard deviations"
     )
     return (line,)
 
@@ -82,11 +87,15 @@ def _remedy(correction: Correction) -> str:
     change = f"{amount(correction.value or 0.0, correction.sd)} {unit}"
     if quantity == "time_offset":
         return f"add {change} to [vehicle] time_offset_s in flight.toml"
+    if unit == "percent":
+        keys = "fx and fy in [camera]" if quantity == "focal_length" else "diameters in [[target]]"
+        return f"change {keys} by {change.replace('percent', '%')}, then run 'kgcp detect' again"
     if quantity == "readout":
         return f"add {change} to [camera] readout_s in flight.toml"
     if quantity.startswith("lever_arm_"):
         axis = quantity.removeprefix("lever_arm_")
-        return f"add {change} to [vehicle] lever_arm_m[{_AXES[axis]}] ({axis}) in flight.toml"
+        text = f"add {change} to [vehicle] lever_arm_m[{_AXES[axis]}] ({axis}) in flight.toml"
+        return f"{text}; {_LIKE_DOWN}" if axis == "down" else text
     axis = quantity.removeprefix("boresight_")
     return (
         "check that [reference] poses and [camera] come from the same adjustment: the images are"

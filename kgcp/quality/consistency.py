@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from statistics import median
 
 import numpy as np
 
@@ -104,14 +105,16 @@ def study_consistency(
         _discrepancies(frames, equations, outlier, fitted, settings.time_offset_s),
         fitted,
         correlation_s,
-        _stated_sd(settings),
+        _stated_sd(settings, [frame.sighting for frame in frames]),
     )
 
 
-def _stated_sd(settings: VehicleSettings) -> Mapping[str, float]:
+def _stated_sd(settings: VehicleSettings, sightings: Sequence[Sighting]) -> Mapping[str, float]:
+    share = median((one.sd_common_distance_m or 0.0) / one.distance_m for one in sightings)
     names = (f"lever_arm_{axis}_m" for axis in ("forward", "right", "down"))
     of_arm = dict(zip(names, settings.sd_lever_arm_m, strict=True))
-    return {"time_offset_s": settings.sd_time_s, **of_arm}
+    of_scale = dict.fromkeys(("diameter_percent", "focal_length_percent"), 100.0 * share)
+    return {"time_offset_s": settings.sd_time_s, **of_arm, **of_scale}
 
 
 def _adjust(

@@ -40,7 +40,7 @@ class ConsistencyEquations:
     """Discrepancies of n frames in ENU axes, with derivatives and covariances."""
 
     offset: FloatArray  # (n, 3): position by the vehicle minus position by the camera [m]
-    # (n, 3, 8): change of the offset by a correction of one unit of each of the `UNKNOWNS`
+    # (n, 3, 10): change of the offset by a correction of one unit of each of the `UNKNOWNS`
     design: FloatArray
     correlated: FloatArray  # (n, 3, 3): covariance by the trajectory, correlated over time [m²]
     # (n, 3, 3): covariance by all errors that are independent from frame to frame [m²]
@@ -78,7 +78,18 @@ class ConsistencyEquations:
             body,
             (since_middle * (velocity - camera_velocity))[:, :, None],
         )
-        design = np.concatenate((*columns, attitude @ cross_matrix(in_camera)), axis=2)
+        # The radius in the image gives the depth; pixel and depth give the rest. So a correction
+        # of the diameter scales the whole translation, and one of the focal length the depth only.
+        depth = attitude[:, :, 2] * in_camera[:, 2:]
+        design = np.concatenate(
+            (
+                *columns,
+                attitude @ cross_matrix(in_camera),
+                -sight[:, :, None],
+                -depth[:, :, None],
+            ),
+            axis=2,
+        )
         correlated = np.array([_correlated_m2(frame.position) for frame in frames])
         independent = _independent_m2(frames, orientations, poses, sight)
         shift = sd_time_s * velocity

@@ -11,9 +11,6 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.quality.robust_gls import separable_unknowns, two_sided_probability
 
-# Largest inflation of a variance by the other unknowns: the standard deviation may be ten times
-# larger than without them.
-_MAX_INFLATION = 100.0
 _SIGNIFICANT = 0.001  # largest probability of a significant correction
 
 
@@ -26,6 +23,10 @@ class Unknown:
     # deviation than this, even if it is estimated alone, is not determined.
     limit: float
     factor: float = 1.0  # converts the unit of the adjustment to that of the name
+    # Largest inflation of its variance by the unknowns before it: its standard deviation may be
+    # ten times larger than without them.
+    max_inflation: float = 100.0
+    is_scale: bool = False  # of the distances: estimated only if significant
 
 
 UNKNOWNS = (
@@ -37,10 +38,13 @@ UNKNOWNS = (
     Unknown("boresight_x_deg", 0.2, math.degrees(1.0)),
     Unknown("boresight_y_deg", 0.2, math.degrees(1.0)),
     Unknown("boresight_z_deg", 0.2, math.degrees(1.0)),
+    Unknown("diameter_percent", 0.01, 100.0, max_inflation=10.0, is_scale=True),
+    Unknown("focal_length_percent", 0.01, 100.0, max_inflation=10.0, is_scale=True),
 )
 """Likeliest first: of unknowns that cannot be separated, the last is not estimated."""
 
 UNKNOWN_LIMITS: FloatArray = np.array([unknown.limit for unknown in UNKNOWNS])
+_MAX_INFLATIONS = [unknown.max_inflation for unknown in UNKNOWNS]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +73,7 @@ class CorrectionEstimate:
     """Corrections, and the sums of squares without and with them."""
 
     corrections: tuple[Correction, ...]  # in the order of `UNKNOWNS`
-    values: FloatArray  # (8,): in the units of the adjustment; 0 where not estimated
+    values: FloatArray  # (10,): in the units of the adjustment; 0 where not estimated
     # sums of squares of the residuals over their stated standard deviations, without and with the
     # corrections
     chi2_before: float
@@ -87,19 +91,37 @@ def estimate_corrections(products: FloatArray, count: int, *, has_sds: bool) -> 
 
     Parameters
     ----------
-    products : (10, 10) array
-        Weighted products of ten columns: those of the 8 unknowns, the discrepancy that they are to
-        cancel, and the effect of one standard deviation of calibration and diameter, an error that
-        all frames share.
+    products : (12, 12) array
+        Weighted products of twelve columns: those of the 10 unknowns, the discrepancy that they
+        are to cancel, and the effect of one standard deviation of calibration and diameter, an
+        error that all frames share.
     count : int
         Number of coordinates compared, three per frame.
     has_sds : bool
         Whether every error has a stated standard deviation. Then the scatter of the residuals can
         only enlarge the standard deviations of the corrections; otherwise it determines them.
+
+    Notes
+    -----
+    A scale of the distances resembles the lever arm's part down. If both were always estimated,
+    both could be too uncertain to be significant, and an error of either would go unnoticed.
     """
+    fitted = _estimate(products, count, UNKNOWNS, has_sds=has_sds)
+    pairs = zip(UNKNOWNS, fitted.corrections, strict=True)
+    if any(unknown.is_scale and found.is_significant for unknown, found in pairs):
+        return fitted
+    others = [unknown for unknown in UNKNOWNS if not unknown.is_scale]
+    return _estimate(products, count, others, has_sds=has_sds)
+
+
+def _estimate(
+    products: FloatArray, count: int, wanted: Sequence[Unknown], *, has_sds: bool
+) -> CorrectionEstimate:
+    """Estimate those corrections that are wanted and determined."""
     normal, observed, common = products[:-2, :-2], products[:-2, -2], products[:-2, -1]
-    determined = np.flatnonzero(np.diag(normal) * UNKNOWN_LIMITS**2 > 1.0).tolist()
-    active, groups = separable_unknowns(normal, determined, [_MAX_INFLATION] * len(UNKNOWNS))
+    is_determined = np.diag(normal) * UNKNOWN_LIMITS**2 > 1.0
+    determined = [i for i, each in enumerate(UNKNOWNS) if each in wanted and is_determined[i]]
+    active, groups = separable_unknowns(normal, determined, _MAX_INFLATIONS)
     inverse = np.linalg.inv(normal[np.ix_(active, active)])
     values = np.zeros(len(UNKNOWNS))
     values[active] = -inverse @ observed[active]
