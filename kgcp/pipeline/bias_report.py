@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -116,7 +116,7 @@ class FlightBias:
     def summary(self) -> Json:
         """Return the numbers of `bias_summary.json`, but without those of re-exposed frames."""
         numbers = bias_numbers(self.study)
-        return summary_of(numbers, assess(numbers, []), [])
+        return summary_of(numbers, self._verdict(numbers), [])
 
     def to_dataframe(self) -> pd.DataFrame:
         """Return the comparisons as a table with the columns of `bias.parquet`."""
@@ -174,6 +174,11 @@ class FlightBias:
         paths = (table, *(folder / name for name in files))
         return Report(content.summary, content.verdict, paths)
 
+    def _verdict(self, numbers: BiasNumbers, reexposed: Sequence[Reexposed] = ()) -> Verdict:
+        consistency = self.consistency
+        agrees = consistency is None or not advice(consistency)
+        return assess(numbers, reexposed, agrees=agrees)
+
     def _content(self, frames: Path | StoredFolder, reexpose: int) -> Content:
         numbers = bias_numbers(self.study)
         shown = [*evenly(numbers.data.distance_m, SPREAD), *numbers.worst]
@@ -181,14 +186,13 @@ class FlightBias:
         closeups, reexposed = _closeups_and_reexposures(
             numbers, self.flight, frames, self.settings, shown, again
         )
-        verdict = assess(numbers, reexposed)
+        verdict = self._verdict(numbers, reexposed)
         consistency = self.consistency
         return Content(
             name=self.flight.name,
             headline=headline(self.flight, self.outcomes),
             facts=facts(self.flight, self.settings, self.outcomes, self.provenance),
             agreement=agreement(consistency),
-            advice=() if consistency is None else advice(consistency),
             doubts=self.doubts,
             numbers=numbers,
             verdict=verdict,

@@ -11,7 +11,7 @@ from kgcp import __version__
 from kgcp.io.files.time_text import format_time
 from kgcp.io.flight.flight import Flight
 from kgcp.io.tables.detections import Outcomes
-from kgcp.quality.advice import advice, rms_m
+from kgcp.quality.advice import advice, is_explained, rms_m
 from kgcp.quality.consistency import Consistency
 from kgcp.quality.number_text import minus
 from kgcp.settings import DetectSettings, Method
@@ -180,6 +180,8 @@ def agreement(consistency: Consistency | None) -> str:
     along, across, up = (f"{1000.0 * m:.0f} mm" if is_small else f"{m:.2f} m" for m in rms)
     outliers = sum(each.is_outlier for each in consistency.discrepancies)
     remark = "" if advice(consistency) else " flight.toml needs no correction."
+    if not is_explained(consistency):
+        remark = " No correction of flight.toml explains it."
     return (
         f"The target's positions by vehicle and by camera differ by {along} along the track,"
         f" {across} across and {up} up (RMS of {len(consistency.discrepancies) - outliers} frames,"

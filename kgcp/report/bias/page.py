@@ -35,6 +35,7 @@ _TITLES = {
     "standardised": "errors over their standard deviations",
     "worst": "largest residuals",
     "left-out": "excluded frames",
+    "consistency": "vehicle and camera",
 }
 """Texts of the links from findings to sections, by the ids of the sections."""
 _DIGITS = 7  # significant, of the values in the page; bias.parquet has all
@@ -48,8 +49,7 @@ class Content:
     headline: str  # program, day, camera, target, CRS
     facts: Sequence[Fact]  # inputs and settings
     agreement: str  # of vehicle and camera, in a sentence
-    advice: Sequence[str]  # changes of flight.toml
-    doubts: Sequence[Doubt]  # other contradictions between the inputs
+    doubts: Sequence[Doubt]  # contradictions between the inputs, and changes of flight.toml
     numbers: BiasNumbers
     verdict: Verdict
     learnt: str  # sentences on the camera, estimated from the frames; may be empty

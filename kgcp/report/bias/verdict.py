@@ -84,11 +84,22 @@ class Verdict:
         return (f"{self.grade.words}.", *(finding.text for finding in self.findings))
 
 
-def assess(numbers: BiasNumbers, reexposed: Sequence[Reexposed] = ()) -> Verdict:
-    """Judge a flight by its numbers and by the distances of frames that were measured again."""
+def assess(
+    numbers: BiasNumbers, reexposed: Sequence[Reexposed] = (), *, agrees: bool = True
+) -> Verdict:
+    """Judge a flight.
+
+    Parameters
+    ----------
+    reexposed : sequence of Reexposed
+        Distances of frames that were measured again.
+    agrees : bool
+        Whether vehicle and camera put the target at the same place.
+    """
     findings = [
         _accuracy(numbers),
         _bias(numbers),
+        *_agreement(agrees=agrees),
         *_causes(numbers),
         *_scatter(numbers),
         *_exclusions(numbers),
@@ -134,6 +145,16 @@ def _bias(numbers: BiasNumbers) -> Finding:
     material = any(abs(row.percent.mean) >= LIMITS.mean_percent for row in numbers.biased)
     text = f"Biased: measured distances are {'; '.join(parts)}."
     return Finding(FlightGrade.LOOK if material else FlightGrade.GOOD, text, "error")
+
+
+def _agreement(*, agrees: bool) -> Iterator[Finding]:
+    """Yield the finding on errors across the line of sight, which distances hardly show."""
+    if not agrees:
+        text = (
+            "Vehicle and camera do not put the target at the same place: the points of 'kgcp"
+            " export-gcp' may be wrong, even if the distances are right."
+        )
+        yield Finding(FlightGrade.LOOK, text, "consistency")
 
 
 def _mean(row: RangeRow) -> str:
@@ -219,8 +240,9 @@ def _scatter(numbers: BiasNumbers) -> Iterator[Finding]:
         yield Finding(
             FlightGrade.LOOK,
             f"Residuals scatter {spread:.1f} times as much as their reported standard deviations"
-            " predict: the standard deviations of trajectory and reference poses may be too small,"
-            " the ring not round, the plate not flat, or the distortion in [camera] wrong.",
+            " predict: lever arm or times may be wrong, the standard deviations of trajectory and"
+            " reference poses too small, the ring not round, the plate not flat, or the distortion"
+            " in [camera] wrong.",
             "standardised",
         )
     elif spread < LIMITS.standardised_low:

@@ -92,6 +92,12 @@ def test_a_flight_that_is_as_reported_is_good(fly: Fly) -> None:
     assert "No exposure quantity varies" in texts(numbers)
 
 
+def test_a_flight_whose_points_are_wrong_is_not_good(fly: Fly) -> None:
+    verdict = assess(fly(), agrees=False)
+    assert verdict.grade is FlightGrade.LOOK
+    assert "Vehicle and camera do not put the target at the same place" in verdict.sentences[1]
+
+
 def test_focal_length_and_lever_arm_are_named(fly: Fly) -> None:
     by_scale = texts(fly(lambda d: 0.004 * d), FlightGrade.LOOK)
     assert "focal length" in by_scale
