@@ -222,7 +222,7 @@ class Reason(StrEnum):
         "poor_fit",
         Status.REJECTED,
         "the grey values do not fit the image of this target",
-        "look at the picture in the contact sheet; use a matt print and a flat plate",
+        "look at the contact sheet; use a matt print and a flat plate; check the diameters",
     )
     DECODE_FAILED = (
         "decode_failed",

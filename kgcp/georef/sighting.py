@@ -37,6 +37,7 @@ class Sighting:
     # (6, 6): share of calibration and diameter, not included in `pose_cov`; None: not known
     common_pose_cov: FloatArray | None = None
     image: CircleImage | None = None  # of a plain target's outer circle, without any prior
+    inner_growth: float | None = None  # as `Appearance.inner_growth`
 
     @property
     def has_heading(self) -> bool:
@@ -89,6 +90,7 @@ def sighting_of(
         ambiguity=None if measurement.alternative is None else measurement.alternative.ambiguity,
         common_pose_cov=None if common is None else common.pose_cov,
         image=measurement.image,
+        inner_growth=measurement.appearance.inner_growth,
     )
 
 

@@ -31,6 +31,9 @@ class Appearance:
         method does not estimate it.
     blur_px : float or None
         Edge spread σ [px]; None where the method does not estimate it.
+    inner_growth : float or None
+        By how much the image shows the main ring's inner circle larger than the layout, relative
+        to the outer one, as a share; None where the method does not estimate it.
     """
 
     radius_px: float
@@ -39,6 +42,7 @@ class Appearance:
     saturated: float
     edge_shift_px: float | None = None
     blur_px: float | None = None
+    inner_growth: float | None = None
 
 
 class ToneBase(StrEnum):

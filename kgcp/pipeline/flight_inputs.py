@@ -271,7 +271,14 @@ class FlightInputs:
         if poses is not None:
             agreement = study_consistency(sightings, positions, poses, camera)
         doubts = measured_doubts(
-            self.plausibility, sightings, positions, poses, camera, self.headers, agreement
+            self.plausibility,
+            sightings,
+            positions,
+            poses,
+            camera,
+            self.headers,
+            agreement,
+            self.flight.all_targets,
         )
         return agreement, doubts
 

@@ -171,6 +171,9 @@ DETECTION_COLUMNS: tuple[Column[_Record], ...] = (
     Column(
         "edge_shift_px", NUMBER, _measured(lambda measurement: measurement.appearance.edge_shift_px)
     ),
+    Column(
+        "inner_growth", NUMBER, _measured(lambda measurement: measurement.appearance.inner_growth)
+    ),
     Column("black", NUMBER, _measured(lambda measurement: measurement.appearance.black)),
     Column("white", NUMBER, _measured(lambda measurement: measurement.appearance.white)),
     Column("saturated", NUMBER, _measured(lambda measurement: measurement.appearance.saturated)),
@@ -375,6 +378,7 @@ def _sighting(row: _Cells, number: int, time_s: float | None) -> Sighting:
         ambiguity=_number(row, "ambiguity"),
         common_pose_cov=_matrix(row, "common_pose_cov", 6),
         image=_circle_image(row),
+        inner_growth=_number(row, "inner_growth"),
     )
 
 

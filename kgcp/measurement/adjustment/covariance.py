@@ -128,7 +128,7 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
         root = np.linalg.cholesky(inverse[:6, :6])
     except np.linalg.LinAlgError as error:
         raise Rejection(Reason.POOR_FIT, "the pixels do not determine the pose") from error
-    circle, arc = _nearest_edges(fit)
+    circle, arc = nearest_edges(fit)
     to_pose = np.linalg.solve(root, inverse[:6])  # in units of N⁻¹
     by_pixel = np.zeros((scaled.shape[1], -(-len(scaled) // _SIMD_WIDTH) * _SIMD_WIDTH))
     by_pixel[:, : len(scaled)] = scaled.T
@@ -309,7 +309,7 @@ def _gradient_by_growth(fit: TargetFit, scaled: FloatArray, circle: IndexArray) 
     return np.asarray(scaled @ by_growth.T)
 
 
-def _nearest_edges(fit: TargetFit) -> tuple[IndexArray, IndexArray]:
+def nearest_edges(fit: TargetFit) -> tuple[IndexArray, IndexArray]:
     """Return, for every pixel, the circle of its nearest edge and the number of the arc there."""
     problem = fit.sample.problem
     circles = problem.circles.part(slice(0, problem.measured_count))

@@ -18,7 +18,7 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose, image_heading_deg
-from kgcp.measurement.adjustment.covariance import propagate, unevenness_factor
+from kgcp.measurement.adjustment.covariance import nearest_edges, propagate, unevenness_factor
 from kgcp.measurement.adjustment.normal_equations import normal_matrix
 from kgcp.measurement.adjustment.solver import TargetFit
 from kgcp.measurement.image_model.edge_terms import smoothing_row
@@ -28,6 +28,8 @@ from kgcp.measurement.records import ContourSmoothing, Measurement
 # In eight flights rendered by other programs, the smoothing had means of −0.07 to 0.09 px², with
 # scatters of 0 to 0.08 px² about them (docs/method.md, "What a flight shares").
 _SD_OF_CAMERAS_PX2, _SCATTER_PX2 = 0.1, 0.05
+# A circle's growth beyond this is no small unknown: one step does not reach it.
+_LARGEST_GROWTH = 0.3
 _SCATTERS_PX2 = np.linspace(0.0, 4.0 * _SCATTER_PX2, 41)
 
 
@@ -44,7 +46,45 @@ def contour_smoothing(fit: TargetFit, inflation: float) -> ContourSmoothing | No
     """
     if not fit.sample.problem.tone.is_unknown:
         return None
-    row, weight = _by_smoothing(fit) / fit.sd, fit.misfit.weight
+    seen_px2, precision, moves = _added_unknown(fit, _by_smoothing(fit))
+    return ContourSmoothing(
+        seen_px2=seen_px2,
+        sd_seen_px2=math.sqrt(inflation * unevenness_factor(fit, inflation) / precision),
+        pose_by_smoothing=moves[:6],
+    )
+
+
+def inner_growth(fit: TargetFit) -> float | None:
+    """Return by how much the image shows the inner circle larger than stated, as a share.
+
+    It is what the inner circle has to grow, relative to the outer one, to fit best. A circle that
+    comes nearer by a share of its distance grows by the same share. None where no pixel tells: if
+    the circle is hidden, or so far from its place that its pixels are outliers.
+    """
+    circle, _ = nearest_edges(fit)
+    approach = -(fit.parameters.pose.translation_m @ fit.jacobian[:3])
+    by_growth = np.where(circle == 1, approach, 0.0)
+    if not np.any(by_growth * fit.misfit.weight):
+        return None
+    growth = _added_unknown(fit, by_growth)[0]
+    return growth if abs(growth) < _LARGEST_GROWTH else None
+
+
+def _added_unknown(fit: TargetFit, by_unknown: FloatArray) -> tuple[float, float, FloatArray]:
+    """Estimate one more unknown at the minimum of all others, whose value is 0 in the fit.
+
+    Parameters
+    ----------
+    by_unknown : (n,) array
+        Derivative of the grey values.
+
+    Returns
+    -------
+    value, precision : float
+    moves : (p,) array
+        Derivatives of the other unknowns by this one.
+    """
+    row, weight = by_unknown / fit.sd, fit.misfit.weight
     own, score = float(row @ (row * weight)), float(row @ fit.misfit.score)
     if fit.level_equations is None:
         scaled = fit.scaled_jacobian
@@ -55,11 +95,7 @@ def contour_smoothing(fit: TargetFit, inflation: float) -> ContourSmoothing | No
     mixed = scaled @ (row * weight)
     moves = np.asarray(-np.linalg.solve(normal, mixed), np.float64)
     precision = own + float(mixed @ moves)
-    return ContourSmoothing(
-        seen_px2=score / precision,
-        sd_seen_px2=math.sqrt(inflation * unevenness_factor(fit, inflation) / precision),
-        pose_by_smoothing=moves[:6],
-    )
+    return score / precision, precision, moves
 
 
 def _by_smoothing(fit: TargetFit) -> FloatArray:

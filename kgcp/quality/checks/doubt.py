@@ -54,7 +54,7 @@ class Cause(StrEnum):
     )
     DIAMETERS = (
         "diameters",
-        "diameters are radii, or in millimetres, inches or feet",
+        "diameters are radii, in millimetres, inches or feet, or not those of the print",
     )
     LAYOUT = "layout", "the search misses rings with such an inner diameter or such dots"
     DISTANCE_SCALE = (

@@ -18,6 +18,7 @@ from kgcp.quality.checks.encounters import Encounters
 from kgcp.quality.checks.frame_header import FrameHeader
 from kgcp.quality.checks.mount import check_mount
 from kgcp.quality.checks.patterns import check_lone_frames, unexplained
+from kgcp.quality.checks.plate import check_print
 from kgcp.quality.checks.static_targets import (
     check_places,
     check_static_targets,
@@ -25,9 +26,13 @@ from kgcp.quality.checks.static_targets import (
 )
 from kgcp.quality.checks.stretch import check_stretch
 from kgcp.quality.consistency import Consistency
+from kgcp.targets.plain import AnyTarget
 
-# Ratio of a disagreement to what a stretch explains, from which on it has another cause, too.
+# Ratio of a disagreement to what the print explains, from which on it has another cause, too.
 _MIN_UNEXPLAINED_RATIO = 3.0
+# Error of the distance by that of the ratio of diameters: 0.13 if the inner diameter alone is
+# wrong, 0.39 if the outer one alone is right.
+_DISTANCE_BY_GROWTH = 0.4
 
 
 def measured_doubts(
@@ -38,6 +43,7 @@ def measured_doubts(
     camera: Camera,
     headers: Sequence[FrameHeader],
     consistency: Consistency | None,
+    targets: Sequence[AnyTarget],
 ) -> tuple[Doubt, ...]:
     """Return all doubts, grave ones first: those from before measuring and those from measurements.
 
@@ -49,6 +55,8 @@ def measured_doubts(
         Headers of some frames.
     consistency : Consistency or None
         From the same sightings and poses.
+    targets : sequence of AnyTarget
+        All targets of the flight.
     """
     static = target_positions.static
     of_static = [*check_static_targets(sightings, static, camera)]
@@ -58,16 +66,29 @@ def measured_doubts(
             if poses is None
             else check_places(sightings, static, poses, camera, target_positions.local_frame)
         )
-    doubts = [*plausibility, *_of_altitude(sightings, headers), *of_static]
+    of_print = [*check_print(sightings, targets, camera)]
+    doubts = [*plausibility, *of_print, *_of_altitude(sightings, headers), *of_static]
     # If an input is certainly wrong, everything that follows from it disagrees.
     if poses is not None and not any(doubt.is_grave for doubt in plausibility):
         encounters = Encounters.of(sightings, target_positions, poses, camera)
         if encounters is not None:
-            doubts += _of_encounters(encounters, consistency)
+            share = max((abs(doubt.figures["inner_growth"]) for doubt in of_print), default=0.0)
+            doubts += _of_encounters(encounters, consistency, _DISTANCE_BY_GROWTH * share)
     return ranked(doubts)
 
 
-def _of_encounters(encounters: Encounters, consistency: Consistency | None) -> Iterator[Doubt]:
+def _of_encounters(
+    encounters: Encounters, consistency: Consistency | None, distance_error: float = 0.0
+) -> Iterator[Doubt]:
+    """Yield doubts about vehicle and camera, unless wrong diameters explain the disagreement.
+
+    Parameters
+    ----------
+    distance_error : float
+        Of all distances, as a share, if the diameters are not those of the print.
+    """
+    if _explains(encounters, distance_error):
+        return
     is_correctable = consistency is not None and is_explained(consistency)
     causes = causes_of(encounters, is_correctable=is_correctable)
     if causes:
@@ -76,16 +97,23 @@ def _of_encounters(encounters: Encounters, consistency: Consistency | None) -> I
     yield from check_mount(encounters)
     for doubt in check_stretch(encounters):
         yield doubt
-        distance_m = float(np.median(np.linalg.norm(encounters.in_camera_m, axis=1)))
-        explained_m = 0.5 * doubt.figures["stretch"] * distance_m
-        if encounters.apart_m < _MIN_UNEXPLAINED_RATIO * explained_m:
-            return  # corrections would compensate for the stretch, and so be wrong
+        if _explains(encounters, 0.5 * doubt.figures["stretch"]):
+            return
     yield from check_lone_frames(encounters)
     if consistency is not None and is_correctable:
         for sentence, remedy in corrections(consistency):
             yield mild(Cause.CORRECTION, sentence, remedy)
     elif MISFIT < encounters.misfit < np.inf:
         yield unexplained(encounters)
+
+
+def _explains(encounters: Encounters, share: float) -> bool:
+    """Tell whether distances that a print makes wrong by a share explain the disagreement.
+
+    Then the print is the cause: corrections would compensate for it, and so be wrong.
+    """
+    distance_m = float(np.median(np.linalg.norm(encounters.in_camera_m, axis=1)))
+    return encounters.apart_m < _MIN_UNEXPLAINED_RATIO * share * distance_m
 
 
 def _of_altitude(sightings: Sequence[Sighting], headers: Sequence[FrameHeader]) -> Iterator[Doubt]:

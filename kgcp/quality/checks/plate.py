@@ -1,10 +1,21 @@
-"""Checks of a target's diameters and layout: metres, and proportions that the search finds."""
+"""Checks of a target's diameters and layout: metres, proportions that the search finds, the print.
+
+A print that is not as stated leaves residuals that are the same in all frames. One frame only has
+larger standard deviations, as if its image were poor; all frames together show the cause.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+from kgcp.georef.sighting import Sighting
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
+from kgcp.quality.number_text import amount
 from kgcp.targets.layout import Ring, Target
 from kgcp.targets.plain import AnyTarget
 
@@ -16,6 +27,13 @@ _USUAL_DIAMETERS_M = 0.15, 3.0
 # 55 % with 0.35 and 69 % with 0.75 (`python -m benchmarks.search.layouts`).
 _INNER_RATIOS = 0.4, 0.7
 _MAX_DOT_SHARE = 0.33  # of the ring's area
+_MIN_FRAMES = 6
+# A print is in doubt if its inner circle is larger or smaller than stated by this share and by so
+# many standard deviations. A share of 0.2 % makes distances wrong by 0.03 to 0.08 %.
+_MIN_GROWTH, _MIN_RATIO = 2e-3, 5.0
+# What may displace the inner edge in all frames alike, as an error of the tone curve does [px]
+_SD_EDGE_PX = 0.03
+_ROBUST_STEPS = 10
 
 
 def check_plates(targets: Sequence[AnyTarget]) -> Iterator[Doubt]:
@@ -61,3 +79,60 @@ def _check_layout(ring: Ring) -> Iterator[Doubt]:
     else:
         return
     yield mild(Cause.LAYOUT, problem, remedy, figures)
+
+
+def check_print(
+    sightings: Sequence[Sighting], targets: Sequence[AnyTarget], camera: Camera
+) -> Iterator[Doubt]:
+    """Yield the doubt about printed diameters whose ratio is not the stated one."""
+    for target in targets:
+        if not isinstance(target, Target):
+            continue
+        ring = target.ring
+        seen = np.array(
+            [
+                (each.distance_m, each.inner_growth)
+                for each in sightings
+                if each.target == target.name and each.inner_growth is not None
+            ]
+        )
+        if len(seen) < _MIN_FRAMES:
+            continue
+        growth, sd = _common_growth(
+            seen[:, 1], 0.5 * ring.inner_diameter_m * camera.mean_focal_px / seen[:, 0]
+        )
+        if abs(growth) < max(_MIN_GROWTH, _MIN_RATIO * sd):
+            continue
+        yield mild(
+            Cause.DIAMETERS,
+            f"in {len(seen)} frames, the inner circle of {target.name!r} is"
+            f" {amount(100.0 * abs(growth), 100.0 * sd)} % too {'large' if growth > 0 else 'small'}"
+            " for the outer one: diameters are not those of the print, and all distances are wrong"
+            " by the same factor",
+            "measure both diameters of the ring and give all lengths of [[target]] as printed"
+            f" (for outer_diameter_m = {ring.outer_diameter_m:g}, an inner_diameter_m of about"
+            f" {ring.inner_diameter_m * (1.0 + growth):.4g} would fit); a print at another scale"
+            " changes all of them; if they are right, check response in [camera]",
+            {"inner_growth": growth, "sd_inner_growth": sd},
+        )
+
+
+def _common_growth(growth: FloatArray, radius_px: FloatArray) -> tuple[float, float]:
+    """Return the growth that n frames have in common, and its standard deviation.
+
+    Whatever displaces edges by the same number of pixels looks like a growth that is inversely
+    proportional to the circle's radius, and is estimated with it. Frames count by the accuracy of
+    an edge along a circle of their size, with Cauchy weights.
+    """
+    design = np.column_stack((np.ones_like(radius_px), 1.0 / radius_px)) * radius_px[:, None] ** 1.5
+    seen = growth * radius_px**1.5
+    values: FloatArray = np.zeros(2)
+    for _ in range(_ROBUST_STEPS):
+        residual = seen - design @ values
+        variance = max(float(np.median(residual**2)) / 0.455, 1e-18)
+        weight = 1.0 / (1.0 + residual**2 / (4.0 * variance))
+        normal = (design * weight[:, None]).T @ design / variance
+        normal[1, 1] += _SD_EDGE_PX**-2
+        right_side = (design * weight[:, None]).T @ seen / variance
+        values = np.asarray(np.linalg.solve(normal, right_side))
+    return float(values[0]), math.sqrt(np.linalg.inv(normal)[0, 0])

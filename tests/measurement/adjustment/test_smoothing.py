@@ -1,4 +1,7 @@
-"""Smoothing along contours: its estimate from one frame, and the combination of all frames."""
+"""Unknowns that are estimated after all others: smoothing along contours, an inner circle's growth.
+
+Smoothing is estimated from one frame, and combined over all frames.
+"""
 
 from __future__ import annotations
 
@@ -115,3 +118,18 @@ def test_smoothing_of_single_frames_is_as_good_as_stated() -> None:
         combined = np.array([learnt.in_measurement(each) for each in alike])
         sigmas.append((combined[:, 0] - truth) / combined[:, 1])
     assert 0.85 < np.sqrt(np.mean(np.square(sigmas))) < 1.15
+
+
+@pytest.mark.parametrize("growth", [-0.01, 0.0, 0.01])
+def test_an_inner_circle_of_another_size_shows(
+    photograph: Callable[..., GreyArray], start_near: Callable[..., InitialPose], growth: float
+) -> None:
+    ring = TARGET_PLATE.target.ring
+    printed = replace(ring, inner_diameter_m=ring.inner_diameter_m * (1.0 + growth))
+    plate = replace(TARGET_PLATE, target=replace(TARGET_PLATE.target, ring=printed))
+    camera = replace(CAMERA, response=Response.LINEAR)
+    rng, pose = np.random.default_rng(3), pose_of(1)
+    grey = photograph(camera, pose, rng, plate=plate)
+    start = start_near(camera, pose, rng)
+    measured = measure_by_model(grey, camera, TARGET_PLATE.target, start)
+    assert measured.appearance.inner_growth == pytest.approx(growth, abs=0.0015)

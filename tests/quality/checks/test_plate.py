@@ -1,13 +1,16 @@
-"""Layouts that are reported as hard to find, and sizes that seem to be in other units."""
+"""Layouts that are hard to find, sizes in other units, and prints that are not as stated."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
+from kgcp.geometry.camera import Camera
+from kgcp.georef.sighting import Sighting
 from kgcp.quality.checks.doubt import Cause
-from kgcp.quality.checks.plate import check_plates
+from kgcp.quality.checks.plate import check_plates, check_print
 from kgcp.targets.layout import Ring, Target
 
 SEVEN_DEG = (0.0, 50.0, 102.0, 155.0, 206.0, 258.0, 311.0)
@@ -54,3 +57,41 @@ def test_diameters_in_other_units_are_reported(outer_m: float, words: str) -> No
     doubts = [*check_plates([target(outer_m)])]
     assert [doubt.code for doubt in doubts] == [Cause.DIAMETERS] * bool(words)
     assert all(words in doubt.sentence and doubt.is_grave for doubt in doubts)
+
+
+CAMERA = Camera(1200, 900, 1900.0, 1900.0, 600.0, 450.0)
+
+
+def sighting(distance_m: float, growth: float) -> Sighting:
+    frame = f"{distance_m:.3f}.png"
+    at = np.array([600.0, 450.0])
+    return Sighting(frame, 1, "A", 0, None, at, None, distance_m, None, None, inner_growth=growth)
+
+
+@pytest.mark.parametrize(
+    ("growth", "edge_px", "frames", "words"),
+    [
+        (0.0, 0.0, 24, ""),
+        (0.001, 0.0, 24, ""),  # negligible
+        (0.010, 0.0, 24, "in 24 frames, the inner circle of 'A' is 1.0"),
+        (-0.010, 0.0, 24, "% too small for the outer one"),
+        (0.010, 0.0, 5, ""),  # too few
+        (0.0, 0.05, 24, ""),  # the tone curve displaces edges, by as many pixels near and far
+        (0.010, 0.05, 24, "% too large for the outer one"),
+    ],
+)
+def test_an_inner_circle_that_is_not_as_stated_in_all_frames_is_reported(
+    growth: float, edge_px: float, frames: int, words: str
+) -> None:
+    rng = np.random.default_rng(7)
+    distances_m = np.geomspace(9.0, 50.0, frames)
+    radii_px = 0.225 * CAMERA.mean_focal_px / distances_m
+    seen = growth + edge_px / radii_px + 0.02 * radii_px**-1.5 * rng.standard_normal(frames)
+    seen[2] = 0.2  # something hid the circle
+    sightings = [*map(sighting, distances_m.tolist(), seen.tolist())]
+    doubts = [*check_print(sightings, [target()], CAMERA)]
+    assert [doubt.code for doubt in doubts] == [Cause.DIAMETERS] * bool(words)
+    for doubt in doubts:
+        assert words in doubt.sentence
+        assert not doubt.is_grave
+        assert doubt.figures["inner_growth"] == pytest.approx(growth, abs=0.001)

@@ -106,6 +106,16 @@ def test_a_stretched_print_is_not_compensated_by_corrections(
     assert [doubt.code for doubt in _of_encounters(far, consistency)] == both
 
 
+def test_wrong_diameters_are_not_compensated_by_corrections(
+    encounters: Encounters, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(measured, "is_explained", lambda _: True)
+    monkeypatch.setattr(measured, "corrections", lambda _: [("they differ", "add 0.04 m")])
+    consistency = cast("Consistency", object())
+    assert [*_of_encounters(encounters, consistency, 1e-5)], "not the cause"
+    assert not [*_of_encounters(encounters, consistency, 0.003)]
+
+
 @pytest.mark.parametrize("direction_deg", [0.0, 135.0])
 def test_stretched_images_are_recognised(encounters: Encounters, direction_deg: float) -> None:
     seen = seen_as(encounters, plate=np.eye(2), image=stretched(direction_deg))
