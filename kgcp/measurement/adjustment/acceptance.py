@@ -89,14 +89,15 @@ def check_code(fit: TargetFit) -> None:
     at_dot, between, sides = _positions_by_code(ring)
     extra = float(excess[between].max(initial=0.0))
     missing = int(np.count_nonzero(excess[at_dot] < -_MISSING_DOT))
-    moved = _largest_moved_light(excess, sides)
+    moved, dot, is_larger = _most_moved_dot(excess, sides)
     if (
         extra > _EXTRA_DOT
         or missing > len(ring.code_deg) // _DOTS_PER_MISSING
         or moved > _MOVED_DOT
     ):
-        light = f"{extra:.0%} of a dot's light elsewhere, {moved:.0%} beside its place"
-        raise Rejection(Reason.OTHER_CODE, f"{missing} dots missing, {light}")
+        light = f"{extra:.0%} of a dot's light elsewhere, {moved:.0%} beside the dot at"
+        place = f"{ring.code_deg[dot]:g} deg, at {'larger' if is_larger else 'smaller'} angles"
+        raise Rejection(Reason.OTHER_CODE, f"{missing} dots missing, {light} {place}")
 
 
 @cache
@@ -122,11 +123,22 @@ def _positions_by_code(ring: Ring) -> tuple[IndexArray, BoolArray, BoolArray]:
     return distance_deg.argmin(axis=0), between, np.stack((before, after))
 
 
-def _largest_moved_light(excess: FloatArray, sides: BoolArray) -> float:
-    """Return the light that is too much on one side of a dot and too little on the other."""
+def _most_moved_dot(excess: FloatArray, sides: BoolArray) -> tuple[float, int, bool]:
+    """Return the dot with most light that is too much on one side and too little on the other.
+
+    Returns
+    -------
+    light : float
+    dot : int
+        Its index in the code.
+    is_larger : bool
+        Whether it is too much where angles are larger than the dot's.
+    """
     beside = excess[:, None] * sides
     surplus, deficit = beside.max(axis=1), -beside.min(axis=1)
-    return float(np.minimum(surplus, deficit[::-1]).max())
+    moved = np.minimum(surplus, deficit[::-1])
+    side, dot = divmod(int(moved.argmax()), moved.shape[1])
+    return float(moved[side, dot]), dot, side == 1
 
 
 def _excess_light_around_code_circle(fit: TargetFit, ring: Ring) -> FloatArray:

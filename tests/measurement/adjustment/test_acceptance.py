@@ -102,6 +102,12 @@ def test_wrong_dots_are_reported_as_another_code(
     assert caught.value.reason is Reason.OTHER_CODE
 
 
+@pytest.mark.parametrize(("angle_deg", "side"), [(47.0, "larger"), (39.0, "smaller")])
+def test_a_moved_dot_is_named(fit_plate: FitPlate, angle_deg: float, side: str) -> None:
+    with pytest.raises(Rejection, match=f"beside the dot at 43 deg, at {side} angles"):
+        check_code(fit_plate((0.0, angle_deg, 78.0, 180.0), 40.0))
+
+
 @pytest.mark.parametrize(
     "spoil",
     [
