@@ -177,7 +177,7 @@ class FlightBias:
     def _verdict(self, numbers: BiasNumbers, reexposed: Sequence[Reexposed] = ()) -> Verdict:
         consistency = self.consistency
         agrees = consistency is None or not advice(consistency)
-        return assess(numbers, reexposed, agrees=agrees)
+        return assess(numbers, reexposed, agrees=agrees, doubt_count=len(self.doubts))
 
     def _content(self, frames: Path | StoredFolder, reexpose: int) -> Content:
         numbers = bias_numbers(self.study)

@@ -85,7 +85,11 @@ class Verdict:
 
 
 def assess(
-    numbers: BiasNumbers, reexposed: Sequence[Reexposed] = (), *, agrees: bool = True
+    numbers: BiasNumbers,
+    reexposed: Sequence[Reexposed] = (),
+    *,
+    agrees: bool = True,
+    doubt_count: int = 0,
 ) -> Verdict:
     """Judge a flight.
 
@@ -95,11 +99,13 @@ def assess(
         Distances of frames that were measured again.
     agrees : bool
         Whether vehicle and camera put the target at the same place.
+    doubt_count : int
+        Number of doubts about the flight's inputs.
     """
     findings = [
         _accuracy(numbers),
         _bias(numbers),
-        *_agreement(agrees=agrees),
+        *_contradictions(agrees=agrees, doubt_count=doubt_count),
         *_causes(numbers),
         *_scatter(numbers),
         *_exclusions(numbers),
@@ -147,13 +153,16 @@ def _bias(numbers: BiasNumbers) -> Finding:
     return Finding(FlightGrade.LOOK if material else FlightGrade.GOOD, text, "error")
 
 
-def _agreement(*, agrees: bool) -> Iterator[Finding]:
-    """Yield the finding on errors across the line of sight, which distances hardly show."""
+def _contradictions(*, agrees: bool, doubt_count: int) -> Iterator[Finding]:
+    """Yield a finding if inputs contradict each other; distances may hardly show it."""
     if not agrees:
         text = (
             "Vehicle and camera do not put the target at the same place: the points of 'kgcp"
             " export-gcp' may be wrong, even if the distances are right."
         )
+        yield Finding(FlightGrade.LOOK, text, "consistency")
+    elif doubt_count:
+        text = f"The inputs raise {counted(doubt_count, 'doubt')}, listed below."
         yield Finding(FlightGrade.LOOK, text, "consistency")
 
 
