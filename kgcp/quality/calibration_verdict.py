@@ -394,9 +394,10 @@ def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
         if _is_aspect_untried(calibration):
             yield "Estimate two focal lengths: the pixels may not be square."
         yield (
-            "Keep zoom, focus and crop the same in all photographs, rotate none of them afterwards,"
-            " and keep the field rigid. If only photographs that do not fit reach the corners, the"
-            " lens may be one that kgcp's models do not describe."
+            "Keep zoom, focus and crop the same in all photographs, switch off the stabilisation,"
+            " which moves lens or sensor, rotate no photograph afterwards, and keep the field"
+            " rigid. If only photographs that do not fit reach the corners, the lens may be one"
+            " that kgcp's models do not describe."
         )
     yield from _handling_advice(calibration, numbers)
     if numbers.places < _ADVISED_PLACES:
@@ -413,7 +414,7 @@ def _handling_advice(calibration: CameraCalibration, numbers: CalibrationNumbers
     if numbers.turned:
         yield (
             "Give all photographs as the camera stored them: programs that apply the orientation of"
-            " EXIF turn some."
+            " EXIF turn some. If none was turned, stabilisation may have moved the principal point."
         )
     change = _focal_change(calibration, numbers)
     if isinstance(change, FocalTrend):

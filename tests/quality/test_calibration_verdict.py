@@ -500,6 +500,7 @@ def test_photographs_that_were_turned_and_fit_nearly_are_named() -> None:
     verdict = judge(result, numbers)
     assert "would fit the others much better if turned by 180°" in verdict.sentence
     assert any("as the camera stored them" in sentence for sentence in verdict.advice)
+    assert any("stabilisation may have moved" in sentence for sentence in verdict.advice)
 
 
 def test_photographs_that_were_not_turned_are_not_said_to_be() -> None:
@@ -515,6 +516,7 @@ def test_with_two_halves_of_two_zooms_none_is_left_out() -> None:
     assert verdict.grade is not CalibrationGrade.GOOD
     assert "worse" in verdict.sentence
     assert any("Keep zoom, focus and crop" in sentence for sentence in verdict.advice)
+    assert any("switch off the stabilisation" in sentence for sentence in verdict.advice)
 
 
 def test_two_of_six_photographs_of_another_zoom_are_left_out_together() -> None:
