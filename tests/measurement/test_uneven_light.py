@@ -279,9 +279,9 @@ def errors_by_phone(
     gain: float = 0.8,
     radius_px: float = RADIUS_PX,
 ) -> tuple[float, float]:
-    """Return the RMS error of six distances in % and in standard deviations."""
+    """Return the RMS error of three distances in % and in standard deviations."""
     camera, errors, sigmas = replace(LENS, response=Response.UNKNOWN), [], []
-    for seed in range(6):
+    for seed in range(FRAMES):
         rng = np.random.default_rng(900 + seed)
         pose = some_pose(rng, radius_px)
         grey = phone_photograph(pose, rng, phone, field=lights(rng), gain=gain)
@@ -293,29 +293,29 @@ def errors_by_phone(
 
 
 def test_halos_of_a_phone_are_not_absorbed_by_levels(start_near: StartNear) -> None:
-    """Without the pixels just beside edges, the RMS error of these plates was 0.0116 %."""
+    """Without the pixels just beside edges, the RMS error of six plates was 0.0116 %."""
     percent, sigmas = errors_by_phone(start_near, Phone())
-    assert 0.003 < percent < 0.0095
-    assert 0.35 < sigmas < 1.4
+    assert 0.0007 < percent < 0.007
+    assert 0.1 < sigmas < 1.4
 
 
 def test_edges_that_a_phone_makes_steeper_have_a_tone_of_their_own(
     start_near: StartNear,
 ) -> None:
-    """With the tone curve of the levels alone, the RMS error was 0.032 %, and z 1.56."""
+    """With the tone curve of the levels alone, the RMS error was 0.035 %, and z 1.96."""
     phone = Phone(Demosaicing.NEAREST, bilateral=0.2, local_tone=0.0)
     percent, sigmas = errors_by_phone(start_near, phone, dirt)
-    assert 0.008 < percent < 0.026
-    assert 0.35 < sigmas < 1.5
+    assert 0.003 < percent < 0.02
+    assert 0.2 < sigmas < 1.5
 
 
 def test_burnt_white_that_a_phone_darkened_counts_as_clipped(
     start_near: StartNear,
 ) -> None:
-    """If the grey value counts as the plate's level, the RMS error of these plates is 0.0115 %."""
+    """If the grey value counts as the plate's level, the RMS error of six plates is 0.0115 %."""
     percent, sigmas = errors_by_phone(start_near, Phone(), gain=1.5, radius_px=110.0)
     assert 0.0012 < percent < 0.008
-    assert 0.35 < sigmas < 1.7
+    assert 0.3 < sigmas < 2.2
 
 
 def test_the_edge_shift_beside_burnt_white_uses_the_visible_white(
@@ -348,10 +348,10 @@ def test_the_edge_shift_beside_burnt_white_uses_the_visible_white(
 def test_the_centre_is_less_certain_if_processing_hides_a_skew(
     start_near: StartNear,
 ) -> None:
-    """With the usual share of the skew's displacement, z of these centres was 2.0."""
+    """With the usual share of the skew's displacement, z of these centres was 2.1."""
     camera, squares = replace(LENS, response=Response.UNKNOWN), []
     phone = Phone(bilateral=0.3)
-    for seed in range(6):
+    for seed in range(FRAMES):
         rng = np.random.default_rng(900 + seed)
         pose, lens = some_pose(rng), Aberration(coma=0.2, coma_deg=rng.uniform(0.0, 360.0))
         grey = phone_photograph(pose, rng, phone, lens)
@@ -360,7 +360,7 @@ def test_the_centre_is_less_certain_if_processing_hides_a_skew(
         assert seen.uncertainty is not None
         off_px = seen.centre_px - camera.project(pose.translation_m[None])[0]
         squares.append(off_px @ np.linalg.solve(seen.uncertainty.centre_cov_px2, off_px))
-    assert 0.6 < math.sqrt(0.5 * np.mean(squares)) < 1.5
+    assert 0.3 < math.sqrt(0.5 * np.mean(squares)) < 1.5
 
 
 @pytest.mark.parametrize(("farther", "near_sigmas"), [(1.35, 3.3), (1.47, 2.0)])
