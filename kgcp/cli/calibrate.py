@@ -22,6 +22,7 @@ from kgcp.errors import KgcpError
 if TYPE_CHECKING:
     from kgcp.pipeline.calibration.results import CalibrationResults
 
+_WAIT = "the camera's tone curve is learned first, which can take minutes"
 # Repeated here because the modules that define them import numpy; a test compares them.
 POINT_MODELS = ("fixed", "stiff", "free")
 LENSES = ("auto", "radial", "brown", "rational")
@@ -176,7 +177,7 @@ def command(
     found = find_photos(photos)
     other = None if against is None else read_other(against, found)
     with (
-        log_to_stderr(is_quiet=is_quiet, as_json=log_json, unit="photo") as log,
+        log_to_stderr(is_quiet=is_quiet, as_json=log_json, unit="photo", wait=_WAIT) as log,
         stopping(log),
         calibrated_photos(found, field, out, options, log) as made,
     ):

@@ -27,6 +27,7 @@ _JSON_PROGRESS_S = 1.0  # between two lines of progress
 # Stages of all frames or photographs, and the rounds before them.
 _ROUNDS = {"first look": 0, "photographs": 0, "overlay": 1}
 _PATIENCE_S = 10.0  # without progress at the start before the wait is explained
+_USUAL_WAIT = "the first run compiles its inner loops (a minute or two)"
 _SHORTEST_STAGE_S = 0.0005  # shorter ones would print as 0.000
 
 
@@ -45,6 +46,8 @@ class Log:
         How often the run goes through all frames: once, or twice if it draws them.
     unit : str
         What is counted.
+    wait : str
+        Why it takes a while until the first of them is finished.
     """
 
     def __init__(
@@ -55,8 +58,9 @@ class Log:
         as_json: bool,
         rounds: int = 1,
         unit: str = "frame",
+        wait: str = _USUAL_WAIT,
     ) -> None:
-        self._bar, self._unit = bar, unit
+        self._bar, self._unit, self._wait = bar, unit, wait
         self.is_quiet, self.is_json = is_quiet, as_json
         self._rounds = rounds
         self._due_s = 0.0
@@ -108,9 +112,7 @@ class Log:
     def explain_wait(self) -> None:
         """Explain the wait if no frame is finished yet."""
         if not self.done:
-            self.note(
-                "no frame is finished yet: the first run compiles its inner loops (a minute or two)"
-            )
+            self.note(f"no {self._unit} is finished yet: {self._wait}")
 
     def stop(self) -> None:
         """Report how far the run got and how to resume it."""
@@ -131,13 +133,18 @@ class Log:
 
 @contextmanager
 def log_to_stderr(
-    *, is_quiet: bool, as_json: bool, rounds: int = 1, unit: str = "frame"
+    *,
+    is_quiet: bool,
+    as_json: bool,
+    rounds: int = 1,
+    unit: str = "frame",
+    wait: str = _USUAL_WAIT,
 ) -> Iterator[Log]:
-    """Show progress until the block ends, in frames or whatever `unit` says."""
+    """Show progress until the block ends, in frames or whatever `unit` says; see `Log`."""
     from tqdm import tqdm
 
     with tqdm(unit=unit, disable=is_quiet or as_json) as bar:
-        log = Log(bar, is_quiet=is_quiet, as_json=as_json, rounds=rounds, unit=unit)
+        log = Log(bar, is_quiet=is_quiet, as_json=as_json, rounds=rounds, unit=unit, wait=wait)
         patience = Timer(_PATIENCE_S, log.explain_wait)
         if sys.stderr.isatty():  # a person may be waiting
             patience.start()

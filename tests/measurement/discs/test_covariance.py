@@ -185,7 +185,7 @@ def test_the_radius_of_a_single_disc_is_as_accurate_as_stated() -> None:
     rng, z = np.random.default_rng(6), []
     pose = Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
     of_size = np.array((0.0, 0.0, 1.0, 0.0, 1.0))
-    for _ in range(5):
+    for _ in range(2):
         discs = tuple(
             SimulatedDisc((*((place + rng.uniform(-0.5, 0.5, 2)) / 20_000.0).tolist(), 0.0), 0.0008)
             for place in places
@@ -199,5 +199,5 @@ def test_the_radius_of_a_single_disc_is_as_accurate_as_stated() -> None:
             nearest = np.linalg.norm(truth[:, :2] - disc.centre_px, axis=1).argmin()
             off = float(of_size @ (disc.vector - truth[nearest]))
             z.append(off / np.sqrt(of_size @ disc.cov @ of_size))
-    assert len(z) == 375
-    assert 0.9 < np.sqrt(np.mean(np.square(z))) < 1.05
+    assert len(z) == 150
+    assert 0.88 < np.sqrt(np.mean(np.square(z))) < 1.12
