@@ -419,6 +419,7 @@ def test_two_fields_in_each_photograph_are_to_be_covered(photos: Path, tmp_path:
     assert "; cover all but one field" in result.stderr
 
 
+@pytest.mark.usefixtures("_no_figures")
 def test_results_that_cannot_be_written_cost_no_measurements(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -145,11 +145,9 @@ def undisturbed_places(names: str) -> dict[str, np.ndarray]:
     ("names", "frames", "off_m"),
     [
         ("ABCD", 6, 0.05),
-        ("ABCD", 6, 1.0),
         ("ABCD", 3, 0.0005),
         ("ABCD", 4, 1.0),
         ("AB", 5, 0.02),
-        ("AB", 6, 1.0),
         ("AB", 8, 1.0),
     ],
 )
@@ -299,15 +297,12 @@ def test_a_target_at_two_distant_places_is_placed_by_most_frames_or_not_at_all(
 
 
 @pytest.mark.usefixtures("_no_figures")
-@pytest.mark.parametrize("names", ["ABCD", "AB"])
-def test_contradictions_that_frames_share_are_not_reduced_by_more_frames(
-    tmp_path: Path, names: str
-) -> None:
+def test_contradictions_that_frames_share_are_not_reduced_by_more_frames(tmp_path: Path) -> None:
     """Another target is taken for B in every second frame: no time at which it was moved."""
     rotations, east = GroundFlight(seed=4).rotations, np.array([1.0, 0.0, 0.0])
     wrong = {(frame, "B"): rotations[frame].T @ east for frame in range(0, 12, 2)}
-    offsets_m = GroundFlight().offsets_m[: len(names)]
-    flight = GroundFlight(names=tuple(names), offsets_m=offsets_m, seed=4, wrong=wrong)
+    offsets_m = GroundFlight().offsets_m[:2]
+    flight = GroundFlight(names=("A", "B"), offsets_m=offsets_m, seed=4, wrong=wrong)
     folder = flight.write(tmp_path / "flight")
     result = run(folder)
     assert result.exit_code == 0, result.stderr

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from kgcp.network.calibration import calibrate_camera
 from kgcp.network.calibration_records import (
@@ -32,11 +31,10 @@ def calibrated(zooms: dict[int, float], turned: tuple[int, ...] = ()) -> CameraC
     return calibrate_camera(made, replace(FIELD, marks=()), (1600, 1200), settings)
 
 
-@pytest.mark.parametrize("rows", [(3,), (0, 3)])
-def test_photographs_of_another_zoom_take_no_part(rows: tuple[int, ...]) -> None:
+def test_photographs_of_another_zoom_take_no_part() -> None:
     """They hide how the field lies in others, and errors of the field as stated hide them."""
-    result = calibrated(dict.fromkeys(rows, 1.2), turned=(8,))
-    assert result.dropped == tuple(f"p{row}" for row in rows)
+    result = calibrated(dict.fromkeys((0, 3), 1.2), turned=(8,))
+    assert result.dropped == ("p0", "p3")
     assert result.points_used is PointModel.STIFF
     assert not result.is_turn_unclear
     assert abs(result.camera.fx - 1500.0) < 4.0 * calibration_numbers(result).sd[0] < 1.0

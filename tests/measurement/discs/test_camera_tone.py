@@ -156,9 +156,7 @@ def test_the_prior_of_burnt_white_does_not_bend_the_curve() -> None:
     assert learned.prior.mean[:3] == pytest.approx((0.0, -0.7, 0.0), abs=0.1)
 
 
-@pytest.mark.parametrize(
-    ("levels", "seed"), [((0.1, 0.62), 0), ((0.62, 0.1), 100), ((0.1, 0.62), 101)]
-)
+@pytest.mark.parametrize(("levels", "seed"), [((0.1, 0.62), 0), ((0.62, 0.1), 100)])
 def test_noise_does_not_bend_a_straight_line(levels: tuple[float, float], seed: int) -> None:
     """Sharpened or not; a curve bent by chance would make small discs 1 % larger."""
     tasks = small_discs(Sensor(sharpening=0.5 * (seed > 0)), levels, 0.0, seed)
