@@ -39,18 +39,21 @@ def name_by_codes(
 ) -> Naming | NamingProblem:
     """Identify the discs of a photograph by the codes that were read.
 
-    A code that occurs twice in a photograph is ignored.
+    A code that occurs twice in a photograph is ignored. If many do, there are two copies of the
+    field, and it is unclear to which of them the other discs belong.
     """
     point_of = {
         ring.canonical(point.code): index
         for index, point in enumerate(field.points)
         if point.code is not None
     }
-    counts = Counter(codes)
+    counts = Counter(code for code in codes if code is not None and code in point_of)
+    if sum(count > 1 for count in counts.values()) >= LEAST_POINTS:
+        return NamingProblem.TWO_FIELDS
     named = [
         (disc, point_of[code])
         for disc, code in enumerate(codes)
-        if code is not None and code in point_of and counts[code] == 1
+        if code is not None and counts[code] == 1
     ]
     if len(named) < LEAST_POINTS:
         return NamingProblem.TOO_FEW

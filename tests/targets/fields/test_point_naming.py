@@ -115,3 +115,4 @@ def test_codes_are_recognised_from_any_starting_sector() -> None:
     }
     twice = [*turned, turned[0], turned[1]]
     assert name_by_codes(twice, field, RING) is NamingProblem.TOO_FEW
+    assert name_by_codes([*turned, *turned[1:]], field, RING) is NamingProblem.TWO_FIELDS
