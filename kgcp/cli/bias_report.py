@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from kgcp.cli.doubts import doubt_json, print_doubts
+from kgcp.cli.doubts import print_doubts
 from kgcp.cli.options import detections_option, flight_place_argument, json_option, out_place_option
 
 if TYPE_CHECKING:
@@ -62,10 +62,8 @@ def command(
     if as_json:
         import json
 
-        summary = report.summary()
         files = [*map(workspace.named, report.files)]
-        doubts = [*map(doubt_json, bias.doubts)]
-        click.echo(json.dumps({**summary, "doubts": doubts, "files": files}))
+        click.echo(json.dumps({**report.summary(), "files": files}))
     for sentence in report.verdict.sentences:
         click.echo(sentence, err=True)
     for path in report.files:

@@ -54,9 +54,7 @@ def command(flight: Path | StoredFolder, *, as_json: bool) -> None:
 def _print_json(checked: FlightCheck) -> None:
     import json
 
-    from kgcp.cli.doubts import doubt_json
-
-    doubts = [doubt_json(doubt) for doubt in checked.doubts]
+    doubts = [doubt.summary() for doubt in checked.doubts]
     click.echo(json.dumps({"name": checked.name, "facts": dict(checked.facts), "doubts": doubts}))
 
 

@@ -24,17 +24,6 @@ def print_doubts(doubts: Iterable[Doubt], *, is_quiet: bool = False, as_json: bo
     """
     for doubt in doubts:
         if as_json:
-            click.echo(json.dumps({"event": "doubt", **doubt_json(doubt)}), err=True)
+            click.echo(json.dumps({"event": "doubt", **doubt.summary()}), err=True)
         elif doubt.is_grave or not is_quiet:
             click.echo(f"kgcp: {doubt.severity.words}: {doubt}", err=True)
-
-
-def doubt_json(doubt: Doubt) -> dict[str, object]:
-    """Return a doubt for machines."""
-    return {
-        "code": doubt.code.value,
-        "severity": doubt.severity.value,
-        "sentence": doubt.sentence,
-        "remedy": doubt.remedy,
-        "figures": dict(doubt.figures),
-    }

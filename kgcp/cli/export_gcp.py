@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from kgcp.cli.doubts import doubt_json, print_doubts
+from kgcp.cli.doubts import print_doubts
 from kgcp.cli.options import (
     LocalPath,
     NumberRange,
@@ -328,13 +328,17 @@ def _print_json(
     from kgcp.quality.advice import advice
 
     written, left_out, older = files
-    found = [part.consistency for part in parts if part.consistency is not None]
     summary = {
         "kgcps": len(whole.gcps),
         "checkpoints": sum(point.is_checkpoint for point in whole.gcps),
         "skipped": dict(_reasons(whole)),
-        "advice": [line for consistency in found for line in advice(consistency)],
-        "doubts": [doubt_json(doubt) for part in parts for doubt in part.doubts],
+        "advice": [
+            line
+            for part in parts
+            if part.consistency is not None
+            for line in advice(part.consistency, part.doubts)
+        ],
+        "doubts": [doubt.summary() for part in parts for doubt in part.doubts],
         "files": [*map(named, written)],
         "left_out": left_out,
         "not_renewed": older,

@@ -35,7 +35,7 @@ from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.flight_inputs import FlightInputs, naming_causes
 from kgcp.pipeline.frame_priors import motions_while_read
 from kgcp.pipeline.workspace import DETECTIONS, require_outside_frames, results_folder
-from kgcp.quality.advice import advice
+from kgcp.quality.advice import agrees
 from kgcp.quality.bias_study import BiasStudy, study_bias
 from kgcp.quality.checks.doubt import Doubt
 from kgcp.quality.consistency import Consistency
@@ -45,7 +45,7 @@ from kgcp.report.bias.numbers import SPREAD, BiasNumbers, bias_numbers, evenly
 from kgcp.report.bias.origin import agreement, facts, headline
 from kgcp.report.bias.page import Content, render_page
 from kgcp.report.bias.reexposure import Reexposed, measure_again
-from kgcp.report.bias.summary import Json, finite, summary_of
+from kgcp.report.bias.summary import Json, summary_of
 from kgcp.report.bias.verdict import Verdict, assess
 from kgcp.report.bias.wording import learnt_sentence
 from kgcp.report.ring_picture import RingView, draw_closeup
@@ -116,7 +116,7 @@ class FlightBias:
     def summary(self) -> Json:
         """Return the numbers of `bias_summary.json`, but without those of re-exposed frames."""
         numbers = bias_numbers(self.study)
-        return summary_of(numbers, self._verdict(numbers), [])
+        return summary_of(numbers, self._verdict(numbers), self.doubts, [])
 
     def to_dataframe(self) -> pd.DataFrame:
         """Return the comparisons as a table with the columns of `bias.parquet`."""
@@ -161,7 +161,7 @@ class FlightBias:
                 )
         content = self._content(stored_frames or flight.frames_folder, reexpose)
         files = {FIGURE_FILES[name]: figure.png for name, figure in content.pictures.items()}
-        text = json.dumps(finite(content.summary), indent=1, allow_nan=False)
+        text = json.dumps(content.summary, indent=1, allow_nan=False)
         files["bias_summary.json"] = f"{text}\n".encode()
         files["bias_report.html"] = render_page(content).encode()
         table = folder / "bias.parquet"
@@ -176,8 +176,8 @@ class FlightBias:
 
     def _verdict(self, numbers: BiasNumbers, reexposed: Sequence[Reexposed] = ()) -> Verdict:
         consistency = self.consistency
-        agrees = consistency is None or not advice(consistency)
-        return assess(numbers, reexposed, agrees=agrees, doubt_count=len(self.doubts))
+        is_agreed = consistency is None or agrees(consistency)
+        return assess(numbers, reexposed, agrees=is_agreed, doubt_count=len(self.doubts))
 
     def _content(self, frames: Path | StoredFolder, reexpose: int) -> Content:
         numbers = bias_numbers(self.study)
@@ -192,7 +192,7 @@ class FlightBias:
             name=self.flight.name,
             headline=headline(self.flight, self.outcomes),
             facts=facts(self.flight, self.settings, self.outcomes, self.provenance),
-            agreement=agreement(consistency),
+            agreement=agreement(consistency, self.doubts),
             doubts=self.doubts,
             numbers=numbers,
             verdict=verdict,
@@ -201,7 +201,7 @@ class FlightBias:
             rows=[bias_row(pair, self.study.method) for pair in numbers.compared],
             closeups=closeups,
             reexposed=reexposed,
-            summary=summary_of(numbers, verdict, reexposed),
+            summary=summary_of(numbers, verdict, self.doubts, reexposed),
         )
 
 

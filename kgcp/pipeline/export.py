@@ -251,4 +251,4 @@ def write_gcps(gcp_set: GcpSet, folder: Path) -> list[Path]:
     if gcp_set.consistency is None:
         remove_consistency(folder)
         return [table]
-    return [table, *write_consistency(folder, gcp_set.consistency, about)]
+    return [table, *write_consistency(folder, gcp_set.consistency, gcp_set.doubts, about)]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
+from kgcp.quality.checks.doubt import Doubt
 from kgcp.quality.consistency import Consistency
 from kgcp.quality.corrections import Correction
 from kgcp.quality.number_text import amount
@@ -18,24 +20,35 @@ _LIKE_DOWN = (
 )
 
 
-def advice(consistency: Consistency) -> tuple[str, ...]:
-    """Return one line per correction that is due; none if vehicle and camera agree.
+def advice(consistency: Consistency, doubts: Sequence[Doubt]) -> tuple[str, ...]:
+    """Return one line per correction to apply; none if vehicle and camera agree.
 
-    A correction is due if it is significant and larger than the standard deviation that flight.toml
-    states. It is offered only if the corrections together explain the disagreement. Otherwise they
-    mean nothing, and a single line says so.
+    These are the corrections that the doubts offer. Where none is offered, because corrections do
+    not explain the disagreement, or because a doubt names a likelier cause, for which they would
+    compensate, a single line says so.
     """
+    if agrees(consistency):
+        return ()
+    offered = {doubt.remedy for doubt in doubts}
+    lines = tuple(remedy for _, remedy in corrections(consistency) if remedy in offered)
+    return lines or (f"{_difference(consistency)}, and {_why_no_correction(consistency)}",)
+
+
+def _why_no_correction(consistency: Consistency) -> str:
     if is_explained(consistency):
-        return tuple(remedy for _, remedy in corrections(consistency))
-    along, across, up = rms_m(consistency)
+        return "no correction is offered, because a doubt names a likelier cause"
+    if consistency.estimate.variance_factor <= _MAX_VARIANCE_FACTOR:
+        return "only implausibly large corrections would explain it"
     ratio = math.sqrt(consistency.estimate.variance_factor)
-    line = (
-        f"vehicle and camera differ by {along:.3f} m along, {across:.3f} m across and {up:.3f} m up"
-        " (RMS), and no correction of lever arm, time, readout, boresight, diameter or focal length"
-        " explains it:"
-        f" even after corrections, residuals are {ratio:.1f} times their standard deviations"
+    return (
+        "no correction of lever arm, time, readout, boresight, diameter or focal length explains"
+        f" it: even after corrections, residuals are {ratio:.1f} times their standard deviations"
     )
-    return (line,)
+
+
+def agrees(consistency: Consistency) -> bool:
+    """Tell whether vehicle and camera agree, so that no correction is due."""
+    return is_explained(consistency) and not corrections(consistency)
 
 
 def is_explained(consistency: Consistency) -> bool:
@@ -46,19 +59,27 @@ def is_explained(consistency: Consistency) -> bool:
 
 
 def corrections(consistency: Consistency) -> tuple[tuple[str, str], ...]:
-    """Return the sentence on the disagreement and the remedy, for each correction that is due."""
+    """Return the sentence on the disagreement and the remedy, for each correction that is due.
+
+    A correction is due if it is significant and larger than the standard deviation that flight.toml
+    states.
+    """
     due = [
         correction
         for correction in consistency.estimate.corrections
         if correction.is_significant
         and abs(correction.value or 0.0) > consistency.stated_sd.get(correction.name, 0.0)
     ]
+    sentence = _difference(consistency)
+    return tuple((sentence, _remedy_with_condition(correction)) for correction in due)
+
+
+def _difference(consistency: Consistency) -> str:
     along, across, up = rms_m(consistency)
-    sentence = (
+    return (
         f"vehicle and camera differ by {along:.3f} m along, {across:.3f} m across, {up:.3f} m up"
         " (RMS)"
     )
-    return tuple((sentence, _remedy_with_condition(correction)) for correction in due)
 
 
 def rms_m(consistency: Consistency) -> tuple[float, float, float]:

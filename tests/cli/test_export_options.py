@@ -17,11 +17,15 @@ from kgcp.cli import main
 from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.io.files.locks import sole_writer
+from kgcp.io.flight.flight import read_flight
 from kgcp.io.tables.columns import time_cell
 from kgcp.io.tables.consistency import CONSISTENCY_COLUMNS
 from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.gcps import GCP_COLUMNS
 from kgcp.io.tables.parquet import read_table, write_table
+from kgcp.pipeline.export import make_gcps
+from kgcp.quality.checks.doubt import Cause, mild
+from kgcp.report.bias.origin import agreement
 from tests.flight_toml import ON_A_VEHICLE
 
 _ORIGIN = np.array([430606.1, 4583523.0, 120.0])
@@ -130,6 +134,31 @@ def test_advice_of_the_summary_disappears_once_it_is_followed(folder: Path) -> N
     heeded = toml.replace("lever_arm_m", f"time_offset_s = {value}\nlever_arm_m")
     (folder / "flight.toml").write_text(heeded, encoding="utf-8")
     assert json.loads(_export(folder, "--json").stdout)["advice"] == []
+
+
+def test_corrections_that_a_doubt_withholds_are_not_advised(folder: Path) -> None:
+    """Corrections would compensate for diameters that are not those of the print."""
+    table = folder / "kgcp" / "detections.parquet"
+    rows = pq.read_table(table).to_pylist()
+    write_table(table, DETECTION_COLUMNS, ({**row, "inner_growth": 0.02} for row in rows), {})
+    printed = json.loads(_export(folder, "--json").stdout)
+    saved = json.loads((folder / "kgcp" / "consistency.json").read_text(encoding="utf-8"))
+    assert [doubt["code"] for doubt in saved["doubts"]] == ["diameters"]
+    assert saved["doubts"] == printed["doubts"]
+    (line,) = printed["advice"]
+    assert saved["advice"] == [line]
+    assert line.endswith("no correction is offered, because a doubt names a likelier cause")
+    assert saved["corrections"][0]["is_significant"]
+
+
+def test_no_page_says_that_a_doubted_flight_needs_no_correction(folder: Path) -> None:
+    toml = (folder / "flight.toml").read_text(encoding="utf-8")
+    right = toml.replace("lever_arm_m", f"time_offset_s = {_LATE_S}\nlever_arm_m")
+    (folder / "flight.toml").write_text(right, encoding="utf-8")
+    made = make_gcps(read_flight(folder))
+    assert agreement(made.consistency, ()).endswith("flight.toml needs no correction.")
+    doubt = mild(Cause.MOUNT, "the plate is turned", "set [vehicle] mount_deg = 0")
+    assert agreement(made.consistency, [doubt]).endswith("(RMS of 40 frames, 0 outliers).")
 
 
 def test_the_summary_says_how_well_the_points_are_known(folder: Path) -> None:

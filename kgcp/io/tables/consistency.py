@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from kgcp.io.files.atomic import remove, write_bytes
 from kgcp.io.tables.columns import BOOLEAN, TEXT, TIME, Column, row_of, time_cell
 from kgcp.io.tables.parquet import write_table
 from kgcp.quality.advice import advice, rms_m
+from kgcp.quality.checks.doubt import Doubt
 from kgcp.quality.consistency import Consistency, Discrepancy
 
 _AXES = ("along", "across", "up")
@@ -34,7 +35,7 @@ CONSISTENCY_COLUMNS: tuple[Column[Discrepancy], ...] = (
 
 
 def write_consistency(
-    folder: Path, consistency: Consistency, metadata: Mapping[str, str]
+    folder: Path, consistency: Consistency, doubts: Sequence[Doubt], metadata: Mapping[str, str]
 ) -> tuple[Path, Path]:
     """Write both files; return their paths.
 
@@ -44,7 +45,7 @@ def write_consistency(
         If they cannot be written.
     """
     summary, table = _paths(folder)
-    text = json.dumps(_summary(consistency), indent=2, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(_summary(consistency, doubts), indent=2, ensure_ascii=False, allow_nan=False)
     write_bytes(summary, f"{text}\n".encode())
     rows = (row_of(CONSISTENCY_COLUMNS, discrepancy) for discrepancy in consistency.discrepancies)
     write_table(table, CONSISTENCY_COLUMNS, rows, metadata)
@@ -61,7 +62,7 @@ def _paths(folder: Path) -> tuple[Path, Path]:
     return folder / "consistency.json", folder / "consistency.parquet"
 
 
-def _summary(consistency: Consistency) -> dict[str, object]:
+def _summary(consistency: Consistency, doubts: Sequence[Doubt]) -> dict[str, object]:
     estimate = consistency.estimate
     return {
         "points": len(consistency.discrepancies),
@@ -75,5 +76,6 @@ def _summary(consistency: Consistency) -> dict[str, object]:
         "chi2_after": estimate.chi2_after,
         "degrees_of_freedom": estimate.degrees_of_freedom,
         "correlation_s": consistency.correlation_s,
-        "advice": advice(consistency),
+        "advice": advice(consistency, doubts),
+        "doubts": [doubt.summary() for doubt in doubts],
     }

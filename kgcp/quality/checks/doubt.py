@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -122,6 +123,19 @@ class Doubt:
     def is_grave(self) -> bool:
         """Whether the results are worthless if the doubt is justified."""
         return self.severity is Severity.GRAVE
+
+    def summary(self) -> dict[str, object]:
+        """Return the doubt for machines; figures that are not finite are None."""
+        return {
+            "code": self.code.value,
+            "severity": self.severity.value,
+            "sentence": self.sentence,
+            "remedy": self.remedy,
+            "figures": {
+                name: value if math.isfinite(value) else None
+                for name, value in self.figures.items()
+            },
+        }
 
     def __str__(self) -> str:
         return one_line("; ".join(filter(None, (self.sentence, self.remedy))))

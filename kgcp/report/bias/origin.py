@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,8 @@ from kgcp import __version__
 from kgcp.io.files.time_text import format_time
 from kgcp.io.flight.flight import Flight
 from kgcp.io.tables.detections import Outcomes
-from kgcp.quality.advice import advice, is_explained, rms_m
+from kgcp.quality.advice import agrees, is_explained, rms_m
+from kgcp.quality.checks.doubt import Doubt
 from kgcp.quality.consistency import Consistency
 from kgcp.quality.number_text import minus
 from kgcp.settings import DetectSettings, Method
@@ -168,8 +169,8 @@ def _settings(settings: DetectSettings) -> str:
     )
 
 
-def agreement(consistency: Consistency | None) -> str:
-    """Return one sentence on how well vehicle and camera agree."""
+def agreement(consistency: Consistency | None, doubts: Sequence[Doubt]) -> str:
+    """Return one sentence on how well vehicle and camera agree; doubts say what to correct."""
     if consistency is None:
         return (
             "Not examined: this requires ten frames with the moving target, a reference pose and a"
@@ -179,8 +180,10 @@ def agreement(consistency: Consistency | None) -> str:
     is_small = max(rms) < 1.0
     along, across, up = (f"{1000.0 * m:.0f} mm" if is_small else f"{m:.2f} m" for m in rms)
     outliers = sum(each.is_outlier for each in consistency.discrepancies)
-    remark = "" if advice(consistency) else " flight.toml needs no correction."
-    if not is_explained(consistency):
+    remark = ""
+    if not doubts and agrees(consistency):
+        remark = " flight.toml needs no correction."
+    elif not doubts and not is_explained(consistency):
         remark = " No correction of flight.toml explains it."
     return (
         f"The target's positions by vehicle and by camera differ by {along} along the track,"

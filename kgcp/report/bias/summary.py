@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 
 from kgcp.quality.bias_causes import Regression
+from kgcp.quality.checks.doubt import Doubt
 from kgcp.quality.statistics import Slope
 from kgcp.report.bias.numbers import BiasNumbers, RangeRow
 from kgcp.report.bias.reexposure import Reexposed
@@ -16,15 +17,21 @@ from kgcp.report.bias.wording import meaning_of
 Json = dict[str, object]
 
 
-def summary_of(numbers: BiasNumbers, verdict: Verdict, reexposed: Sequence[Reexposed]) -> Json:
+def summary_of(
+    numbers: BiasNumbers,
+    verdict: Verdict,
+    doubts: Sequence[Doubt],
+    reexposed: Sequence[Reexposed],
+) -> Json:
     """Return everything that `bias_summary.json` holds."""
     frames, regression, edges = numbers.frames, numbers.regression, numbers.edges
-    return {
+    summary = {
         "verdict": verdict.grade.name.lower(),
         "findings": [
             {"grade": finding.grade.name.lower(), "text": finding.text}
             for finding in verdict.findings
         ],
+        "doubts": [doubt.summary() for doubt in doubts],
         "limits": asdict(LIMITS),
         "compared": numbers.total.percent.count,
         "residual_percent": asdict(numbers.total.percent),
@@ -67,6 +74,7 @@ def summary_of(numbers: BiasNumbers, verdict: Verdict, reexposed: Sequence[Reexp
         "left_out": dict(numbers.left_out),
         "attitudes_agree": numbers.attitudes_agree,
     }
+    return {key: finite(item) for key, item in summary.items()}
 
 
 def _range(row: RangeRow) -> Json:

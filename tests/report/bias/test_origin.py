@@ -72,4 +72,4 @@ def test_unknown_parts_are_left_out(flight: Flight) -> None:
     assert "Eccentricity" not in labels
     assert "Frames" not in [fact.label for fact in facts(flight, DetectSettings(), None, {})]
     assert "flown" not in headline(flight, timeless)
-    assert agreement(None).startswith("Not examined: this requires ten frames")
+    assert agreement(None, ()).startswith("Not examined: this requires ten frames")
