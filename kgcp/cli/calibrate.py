@@ -192,7 +192,7 @@ def command(
             "not_renewed": results.not_renewed,
         }
         click.echo(json.dumps({**results.summary, **file_notes}))
-    if log_json:
+    if log_json and not is_quiet:
         log.event("summary", **results.summary)
     elif not is_quiet:
         _report(results)

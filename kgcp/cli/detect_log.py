@@ -68,10 +68,12 @@ class Log:
         self.done = self.total = 0
 
     def note(self, text: str) -> None:
-        """Print a line."""
+        """Print a line, unless errors only are wanted."""
+        if self.is_quiet:
+            return
         if self.is_json:
             self.event("note", text=text)
-        elif not self.is_quiet:
+        else:
             self._bar.clear()
             click.echo(f"kgcp: {text}", err=True)
 
@@ -92,7 +94,8 @@ class Log:
             beside[stage.split(maxsplit=1)[0]] = f"{done}/{total}"
         self._bar.set_postfix(beside, refresh=False)
         self._bar.update(frames - self._bar.n)
-        if self.is_json and (time.monotonic() >= self._due_s or done == total):
+        is_wanted = self.is_json and not self.is_quiet
+        if is_wanted and (time.monotonic() >= self._due_s or done == total):
             self._due_s = time.monotonic() + _JSON_PROGRESS_S
             self.event("progress", stage=stage, done=done, total=total, found=found)
 
@@ -189,9 +192,11 @@ def report(
         files["overlay"] = str(overlay / "index.html")
     if as_json:
         click.echo(json.dumps({**numbers, **files}))
+    if log.is_quiet:
+        return
     if log.is_json:
         log.event("summary", **numbers, **files)
-    elif not log.is_quiet:
+    else:
         _report_in_words(summary, seconds, frames_per_s)
         click.echo(f"wrote {' and '.join(files.values())}", err=True)
 

@@ -23,7 +23,9 @@ def print_doubts(doubts: Iterable[Doubt], *, is_quiet: bool = False, as_json: bo
         Print each as one JSON object.
     """
     for doubt in doubts:
+        if is_quiet and not doubt.is_grave:
+            continue
         if as_json:
             click.echo(json.dumps({"event": "doubt", **doubt.summary()}), err=True)
-        elif doubt.is_grave or not is_quiet:
+        else:
             click.echo(f"kgcp: {doubt.severity.words}: {doubt}", err=True)

@@ -9,9 +9,25 @@ from pathlib import Path
 import pytest
 
 from kgcp.cli.detect_log import log_to_stderr, report
+from kgcp.cli.doubts import print_doubts
 from kgcp.errors import Reason
 from kgcp.measurement.records import ExposureSettings, FrameResult, Miss
-from kgcp.pipeline.run_summary import SummaryBuilder
+from kgcp.pipeline.run_summary import DetectionSummary, SummaryBuilder
+from kgcp.quality.checks.doubt import Cause, grave, mild
+
+
+def _summary(table: Path) -> DetectionSummary:
+    return SummaryBuilder({}).summary(
+        table=table,
+        likely_cause=None,
+        frames_not_chosen=0,
+        learnt=None,
+        kept=0,
+        frames_without_attitude=0,
+        not_drawn=0,
+        guide_problem=None,
+        stages_s={},
+    )
 
 
 def test_a_wait_is_explained_until_a_frame_is_done(capsys: pytest.CaptureFixture[str]) -> None:
@@ -30,10 +46,18 @@ def test_calibrations_have_a_reason_of_their_own(capsys: pytest.CaptureFixture[s
     assert "no photo is finished yet: it learns" in capsys.readouterr().err
 
 
-def test_quiet_runs_do_not_explain_waits(capsys: pytest.CaptureFixture[str]) -> None:
-    with log_to_stderr(is_quiet=True, as_json=False) as log:
+@pytest.mark.parametrize("as_json", [False, True])
+def test_quiet_runs_print_nothing_but_errors_and_grave_doubts(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, *, as_json: bool
+) -> None:
+    with log_to_stderr(is_quiet=True, as_json=as_json) as log:
         log.explain_wait()
+        log.progress("first look", 1, 1, 0)
+        report(_summary(tmp_path), "table", None, 2.0, log, as_json=False)
+    print_doubts([mild(Cause.CLOCK, "late", "wait")], is_quiet=True, as_json=as_json)
     assert not capsys.readouterr().err
+    print_doubts([grave(Cause.CLOCK, "late", "wait")], is_quiet=True, as_json=as_json)
+    assert "late" in capsys.readouterr().err
 
 
 def test_a_stopped_run_reports_its_progress(capsys: pytest.CaptureFixture[str]) -> None:
@@ -88,19 +112,9 @@ def test_frames_from_an_earlier_run_do_not_count_in_the_speed() -> None:
 def test_the_speed_is_that_of_the_frames_processed_in_this_run(
     kept: int, speed: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    summary = SummaryBuilder({}).summary(
-        table=tmp_path,
-        likely_cause=None,
-        frames_not_chosen=0,
-        learnt=None,
-        kept=kept,
-        frames_without_attitude=0,
-        not_drawn=0,
-        guide_problem=None,
-        stages_s={},
-    )
+    summary = replace(_summary(tmp_path), kept=kept, frames=1)
     with log_to_stderr(is_quiet=False, as_json=False) as log:
-        report(replace(summary, frames=1), "table", None, 2.0, log, as_json=False)
+        report(summary, "table", None, 2.0, log, as_json=False)
     assert f"1 frame in 2.0 s{speed}: 0 measured" in capsys.readouterr().err
 
 
