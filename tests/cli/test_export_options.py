@@ -151,6 +151,15 @@ def test_corrections_that_a_doubt_withholds_are_not_advised(folder: Path) -> Non
     assert saved["corrections"][0]["is_significant"]
 
 
+def test_a_table_of_an_older_kgcp_can_be_used_and_is_named(folder: Path) -> None:
+    table = folder / "kgcp" / "detections.parquet"
+    points = _export(folder) and (folder / "kgcp" / "kgcps.csv").read_bytes()
+    pq.write_table(pq.read_table(table).drop_columns(["inner_growth"]), table)
+    result = _export(folder)
+    assert (folder / "kgcp" / "kgcps.csv").read_bytes() == points
+    assert result.stderr.count("an older kgcp wrote it, without inner_growth") == 1
+
+
 def test_no_page_says_that_a_doubted_flight_needs_no_correction(folder: Path) -> None:
     toml = (folder / "flight.toml").read_text(encoding="utf-8")
     right = toml.replace("lever_arm_m", f"time_offset_s = {_LATE_S}\nlever_arm_m")

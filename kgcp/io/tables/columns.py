@@ -40,11 +40,15 @@ NUMBER, NUMBERS, TIME = ColumnType.NUMBER, ColumnType.NUMBERS, ColumnType.TIME
 
 @dataclass(frozen=True, slots=True)
 class Column(Generic[Record]):
-    """One column of a table: `get` returns its cell for a record, None for null."""
+    """One column of a table: `get` returns its cell for a record, None for null.
+
+    Older tables of the same version lack a column that `is_later`; it is null for their records.
+    """
 
     name: str
     type: ColumnType
     get: Callable[[Record], object]
+    is_later: bool = False
 
     @classmethod
     def of_vector(

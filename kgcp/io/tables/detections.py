@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from collections import Counter
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, fields
@@ -15,7 +16,7 @@ import numpy as np
 import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
-from kgcp.errors import KgcpError, Status
+from kgcp.errors import KgcpError, KgcpWarning, Status
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import Pose
 from kgcp.georef.sighting import Attempt, Exposure, Sighting
@@ -172,7 +173,10 @@ DETECTION_COLUMNS: tuple[Column[_Record], ...] = (
         "edge_shift_px", NUMBER, _measured(lambda measurement: measurement.appearance.edge_shift_px)
     ),
     Column(
-        "inner_growth", NUMBER, _measured(lambda measurement: measurement.appearance.inner_growth)
+        "inner_growth",
+        NUMBER,
+        _measured(lambda measurement: measurement.appearance.inner_growth),
+        is_later=True,
     ),
     Column("black", NUMBER, _measured(lambda measurement: measurement.appearance.black)),
     Column("white", NUMBER, _measured(lambda measurement: measurement.appearance.white)),
@@ -239,6 +243,15 @@ def read_attempts(path: Path, flight: Flight) -> list[Attempt]:
     """
     table = read_detections(path)
     require_current(path, table, flight)
+    names = pq.read_schema(path).names
+    absent = [column.name for column in DETECTION_COLUMNS if column.name not in names]
+    if absent:
+        warnings.warn(
+            f"{path}: an older kgcp wrote it, without {', '.join(absent)}: doubts that need this"
+            " are not raised; repeat 'kgcp detect' to have them",
+            KgcpWarning,
+            stacklevel=2,
+        )
     unknown = sorted(set(table["target"]) - {target.name for target in flight.all_targets})
     if unknown:
         raise KgcpError(

@@ -79,8 +79,8 @@ def read_table(path: Path, columns: Sequence[Column[Any]]) -> pd.DataFrame:
     Raises
     ------
     KgcpError
-        If the file is missing, not Parquet, of another version, lacks declared columns, or has them
-        with another type, twice, or with null in a key.
+        If the file is missing, not Parquet, of another version, lacks declared columns that are not
+        later ones, or has columns with another type, twice, or with null in a key.
     """
     if is_no_file(path):
         raise KgcpError(f"{path}: does not exist; run the command that writes it first")
@@ -92,6 +92,10 @@ def read_table(path: Path, columns: Sequence[Column[Any]]) -> pd.DataFrame:
         reason = (str(error).splitlines() or ["damaged"])[0]
         raise KgcpError(f"{path}: is not a readable Parquet table ({reason}); remake it") from error
     _check_version(path, table.schema.metadata or {})
+    for column in columns:
+        if column.is_later and column.name not in table.column_names:
+            cells = pa.nulls(len(table), _ARROW_TYPES[column.type])
+            table = table.append_column(column.name, cells)
     missing = [column.name for column in columns if column.name not in table.column_names]
     if missing:
         raise KgcpError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -143,6 +144,18 @@ def test_a_table_of_other_columns_is_named_with_what_it_lacks(tmp_path: Path) ->
     with pytest.raises(KgcpError, match="lacks the columns count, value_m, time, cov;") as caught:
         read_table(path, COLUMNS)
     one_line(caught.value)
+
+
+def test_a_column_that_is_later_than_the_table_is_null(tmp_path: Path) -> None:
+    path = tmp_path / "t.parquet"
+    write_table(path, COLUMNS, ROWS, {})
+    sizes = Column("size_m", ColumnType.NUMBER, str, is_later=True)
+    later = Column("sizes_m", ColumnType.NUMBERS, str, is_later=True)
+    table = read_table(path, (*COLUMNS, sizes, later))
+    assert table[["size_m", "sizes_m"]].isna().all(axis=None)
+    assert table["size_m"].dtype == np.float64
+    with pytest.raises(KgcpError, match="lacks the columns size_m;"):
+        read_table(path, (*COLUMNS, replace(sizes, is_later=False)))
 
 
 @pytest.mark.parametrize(
