@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from kgcp.errors import SettingError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.georef.gcp import Flag, Gcp, SkippedSighting, SkipReason
@@ -17,6 +18,8 @@ from kgcp.georef.jumps import find_jumps
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.sighting import Sighting
 from kgcp.settings import require_flag, require_range
+
+_PAIR = 2  # frame and target
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +60,20 @@ class Selection:
         require_range("min_spacing_m", self.min_spacing_m, 0.0, math.inf, unit="m")
         require_range("checkpoint_share", self.checkpoint_share, 0.0, 1.0)
         require_flag("keep_flagged", self.keep_flagged)
+        for pair in self.excluded:
+            if not _is_pair(pair):
+                raise SettingError(
+                    "excluded",
+                    f"{pair!r} is no pair of frame and target",
+                    "give (frame, target), with an empty target for all in the frame",
+                )
+
+
+def _is_pair(value: object) -> bool:
+    """Tell whether a value is a pair of names."""
+    if not isinstance(value, tuple | list):
+        return False
+    return len(value) == _PAIR and all(isinstance(name, str) for name in value)
 
 
 def exclude(

@@ -62,7 +62,7 @@ def excluded_rows(
             unknown.append(exclusion)
         for name in flights:
             chosen[name].append((exclusion.frame, exclusion.target))
-    _warn_of_unknown(unknown)
+    _warn(unknown)
     return {name: tuple(sorted(set(pairs))) for name, pairs in chosen.items()}
 
 
@@ -72,7 +72,20 @@ def _is_known(exclusion: Exclusion, rows: set[FrameAndTarget]) -> bool:
     return any(frame == exclusion.frame for frame, _ in rows)
 
 
-def _warn_of_unknown(unknown: Sequence[Exclusion]) -> None:
+def warn_of_unknown(pairs: Iterable[FrameAndTarget], table: Path) -> None:
+    """Warn of pairs of `Selection.excluded` that match no row of a table of detections.
+
+    Raises
+    ------
+    KgcpError
+        If the table is missing or unreadable.
+    """
+    exclusions = [Exclusion("", frame, target) for frame, target in pairs]
+    if exclusions:
+        excluded_rows(exclusions, {"": rows_of(table)})
+
+
+def _warn(unknown: Sequence[Exclusion]) -> None:
     if unknown:
         shown = "; ".join(map(str, unknown[:_MAX_SHOWN]))
         more = f" and {len(unknown) - _MAX_SHOWN} more" if len(unknown) > _MAX_SHOWN else ""

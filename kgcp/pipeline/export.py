@@ -27,12 +27,14 @@ from kgcp.io.tables.detections import read_attempts
 from kgcp.io.tables.gcps import GCP_COLUMNS, gcp_row
 from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.provenance import derived_provenance
+from kgcp.pipeline.exclude import warn_of_unknown
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.flight_inputs import FlightInputs, missing_frames, naming_causes
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.checks.doubt import Doubt, ranked
 from kgcp.quality.consistency import Consistency
 from kgcp.quality.number_text import rounded
+from kgcp.settings import require_kind
 
 _DEFAULT_SELECTION = Selection()
 
@@ -105,6 +107,9 @@ def make_gcps(
         unusable.
     """
     require_flight(flight)
+    require_kind("selection", selection, Selection)
+    if crs is not None:
+        require_kind("crs", crs, str, "give a text such as 'EPSG:25832'")
     table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
     attempts = read_attempts(table, flight)
     sightings, excluded = _sightings(table, attempts, selection)
@@ -162,6 +167,7 @@ def _sightings(
             f"{table}: no target was measured in any frame;"
             " see the reasons that 'kgcp detect' gives"
         )
+    warn_of_unknown(selection.excluded, table)
     sightings, excluded = exclude(measured, selection.excluded)
     if not sightings:
         raise KgcpError(f"{table}: all {len(measured)} sightings are excluded; exclude fewer")
@@ -229,6 +235,7 @@ def write_formats(points: MapPoints, formats: Sequence[str], folder: Path) -> li
     KgcpError
         As `export_gcps`.
     """
+    formats = tuple(formats)  # of a generator, too
     unknown = [name for name in formats if name not in FORMATS]
     if unknown:
         raise KgcpError(f"format {unknown[0]!r}: is unknown; give one of {', '.join(FORMATS)}")

@@ -14,8 +14,10 @@ import pytest
 from click.testing import CliRunner, Result
 
 from kgcp.cli import main
+from kgcp.errors import KgcpWarning
 from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.local_frame import LocalFrame
+from kgcp.georef.selection import Selection
 from kgcp.io.files.locks import sole_writer
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.tables.columns import time_cell
@@ -23,7 +25,7 @@ from kgcp.io.tables.consistency import CONSISTENCY_COLUMNS
 from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.gcps import GCP_COLUMNS
 from kgcp.io.tables.parquet import read_table, write_table
-from kgcp.pipeline.export import make_gcps
+from kgcp.pipeline.export import export_gcps, make_gcps
 from kgcp.quality.checks.doubt import Cause, mild
 from kgcp.report.bias.origin import agreement
 from tests.flight_toml import ON_A_VEHICLE
@@ -153,11 +155,21 @@ def test_corrections_that_a_doubt_withholds_are_not_advised(folder: Path) -> Non
 
 def test_a_table_of_an_older_kgcp_can_be_used_and_is_named(folder: Path) -> None:
     table = folder / "kgcp" / "detections.parquet"
-    points = _export(folder) and (folder / "kgcp" / "kgcps.csv").read_bytes()
+    _export(folder)
+    points = (folder / "kgcp" / "kgcps.csv").read_bytes()
     pq.write_table(pq.read_table(table).drop_columns(["inner_growth"]), table)
     result = _export(folder)
     assert (folder / "kgcp" / "kgcps.csv").read_bytes() == points
     assert result.stderr.count("an older kgcp wrote it, without inner_growth") == 1
+
+
+def test_programs_are_warned_of_exclusions_that_match_nothing(folder: Path) -> None:
+    selection = Selection(excluded=(("f_00.jpg", ""), ("f_99.jpg", "A")))
+    with pytest.warns(KgcpWarning, match=r"1 lines .* name no row .*\(f_99.jpg, A\)"):
+        made = make_gcps(read_flight(folder), selection=selection)
+    assert {each.frame for each in made.skipped} >= {"f_00.jpg"}
+    written = export_gcps(made, (name for name in ["csv"]), folder / "other")  # type: ignore[arg-type]
+    assert [path.name for path in written] == ["kgcps.csv"]
 
 
 def test_no_page_says_that_a_doubted_flight_needs_no_correction(folder: Path) -> None:
