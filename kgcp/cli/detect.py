@@ -214,7 +214,8 @@ def command(
                 the_flight, settings, out=workspace.out, options=options, listener=log
             )
     seconds = time.perf_counter() - start
-    report(summary, workspace.named(summary.table), overlay, seconds, log, as_json=as_json)
+    table = workspace.named(summary.table)
+    report(summary, table, overlay, seconds, log, as_json=as_json, doubts=doubts)
     if is_profiled:
         report_stages(summary, start - STARTED_S, time.perf_counter() - STARTED_S, log)
     if summary.problem is not None:

@@ -6,7 +6,7 @@ import json
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Timer
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
     from kgcp.pipeline.run_summary import DetectionSummary
+    from kgcp.quality.checks.doubt import Doubt
 
 _EXIT_SIGNAL = 128  # plus the signal's number, as shells count
 _JSON_PROGRESS_S = 1.0  # between two lines of progress
@@ -183,15 +184,20 @@ def report(
     log: Log,
     *,
     as_json: bool,
+    doubts: Sequence[Doubt] = (),
 ) -> None:
-    """Print the counts of the run; with `as_json` also to stdout."""
+    """Print the counts of the run; with `as_json` also to stdout, and the doubts about the flight.
+
+    stderr has the doubts already.
+    """
     frames_per_s = (summary.frames - summary.kept) / seconds
     numbers = {**summary.numbers(), "seconds": seconds, "frames_per_s": frames_per_s}
     files = {"table": table}
     if overlay is not None:
         files["overlay"] = str(overlay / "index.html")
     if as_json:
-        click.echo(json.dumps({**numbers, **files}))
+        about = {"doubts": [doubt.summary() for doubt in doubts]}
+        click.echo(json.dumps({**numbers, **about, **files}))
     if log.is_quiet:
         return
     if log.is_json:

@@ -66,6 +66,10 @@ def test_unreadable_frames_become_rows_beside_the_measured_ones(flight: Path) ->
     assert "no target was measured in any of 7 frames: 3 " in result.stderr.splitlines()[-1]
     summary = json.loads(result.stdout)
     assert summary["frames"] == 7
+    printed = [line for line in result.stderr.splitlines() if "doubt: " in line]
+    for doubt, line in zip(summary["doubts"], printed, strict=True):
+        assert doubt["sentence"] in line
+    assert [doubt["code"] for doubt in summary["doubts"]] == ["frame_size"]
     status = summary["status"]
     assert (status["measured"], status["unreadable"]) == (0, 4)
     assert status["not_found"] + status["rejected"] == 3  # noise may have a ring or not

@@ -10,6 +10,7 @@ from unittest.mock import Mock
 
 import cv2
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner, Result
 from PIL import ExifTags, Image
@@ -144,6 +145,12 @@ def test_every_photograph_has_its_row(calibration: tuple[Path, Result]) -> None:
 def test_exactly_the_numbers_that_exist_are_documented(calibration: tuple[Path, Result]) -> None:
     numbers = json.loads((calibration[0] / "calibration.json").read_text(encoding="utf-8"))
     assert numbers.keys() | {"against"} == set(first_column(section("calibration.json")))
+
+
+def test_the_tables_state_versions(calibration: tuple[Path, Result]) -> None:
+    for name in ("photos", "field", "observations"):
+        metadata = pq.read_schema(calibration[0] / f"{name}.parquet").metadata
+        assert sorted(metadata) == [b"kgcp.schema_version", b"kgcp.version"]
 
 
 def test_the_page_is_self_contained_and_complete(calibration: tuple[Path, Result]) -> None:

@@ -146,7 +146,7 @@ def write_results(
         figures["against"] = draw_comparison(calibration.camera, comparison.difference)
     page = CalibrationPage(calibration, numbers, verdict, photos, figures, names, comparison)
     texts[PAGE_FILE] = render_calibration(page)
-    about = {"schema_version": SCHEMA_VERSION, "kgcp_version": __version__}
+    about = {"schema_version": SCHEMA_VERSION, "version": __version__}
     for name, columns, rows in tables:
         write_table(out / name, columns, rows, about)
     write_all({out / name: text.encode() for name, text in texts.items()})
