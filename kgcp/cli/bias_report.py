@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING
 import click
 
 from kgcp.cli.doubts import print_doubts
-from kgcp.cli.options import detections_option, flight_place_argument, json_option, out_place_option
+from kgcp.cli.options import (
+    detections_option,
+    flight_place_argument,
+    json_option,
+    out_place_option,
+    quiet_option,
+)
 
 if TYPE_CHECKING:
     from kgcp.io.images.remote import StoredFolder
@@ -26,6 +32,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Measure N frames, near and far, again with darker and brighter grey values; 0 skips it.",
 )
+@quiet_option
 @json_option
 def command(
     flight: Path | StoredFolder,
@@ -33,6 +40,7 @@ def command(
     detections: Path | None,
     reexpose: int,
     *,
+    is_quiet: bool,
     as_json: bool,
 ) -> None:
     """Compare measured distances with reference camera poses.
@@ -54,7 +62,7 @@ def command(
     with open_workspace(flight, out, (DETECTIONS,)) as workspace:
         the_flight = read_flight(workspace.flight)
         bias = bias_study(the_flight, workspace.detections(detections))
-        print_doubts(bias.doubts)
+        print_doubts(bias.doubts, is_quiet=is_quiet)
         with sole_writer(workspace.out, "bias-report"):
             report = bias.write_report(
                 workspace.out, reexpose=reexpose, stored_frames=workspace.frames_of(the_flight)
@@ -64,6 +72,8 @@ def command(
 
         files = [*map(workspace.named, report.files)]
         click.echo(json.dumps({**report.summary(), "files": files}))
+    if is_quiet:
+        return
     for sentence in report.verdict.sentences:
         click.echo(sentence, err=True)
     for path in report.files:

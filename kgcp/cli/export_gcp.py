@@ -18,6 +18,7 @@ from kgcp.cli.options import (
     flight_places_argument,
     json_option,
     out_place_option,
+    quiet_option,
     selection_options,
 )
 from kgcp.io.exporters.formats import DEFAULT_FORMATS, FORMATS
@@ -104,6 +105,7 @@ def _list_formats(context: click.Context, _: click.Parameter, asked: bool) -> No
 )
 @selection_options
 @detections_option
+@quiet_option
 @json_option
 def command(
     flights: tuple[Path | StoredFolder, ...],
@@ -113,6 +115,7 @@ def command(
     crs: str | None,
     exclude_files: tuple[Path, ...],
     flight_ids: bool,
+    is_quiet: bool,
     as_json: bool,
     **options: Any,  # noqa: ANN401 - of the files, and the fields of a Selection
 ) -> None:
@@ -147,10 +150,17 @@ def command(
             raise click.UsageError("several flights need a folder for their points: give --out")
         if detections is not None:
             raise click.UsageError("--detections applies to one flight only; leave it out")
-        _export_several(flights, out, choice, files, as_json=as_json)
+        _export_several(flights, out, choice, files, is_quiet=is_quiet, as_json=as_json)
     else:
         _export_one(
-            flights[0], out, detections, choice, files, flight_ids=flight_ids, as_json=as_json
+            flights[0],
+            out,
+            detections,
+            choice,
+            files,
+            flight_ids=flight_ids,
+            is_quiet=is_quiet,
+            as_json=as_json,
         )
 
 
@@ -188,6 +198,7 @@ def _export_one(
     files: FileOptions,
     *,
     flight_ids: bool,
+    is_quiet: bool,
     as_json: bool,
 ) -> None:
     from dataclasses import replace
@@ -212,7 +223,10 @@ def _export_one(
             )
             written += more
             older = not_renewed(workspace.out, written)
-    _report([made], made, (written, left_out, older), workspace.named, as_json=as_json)
+    about_files = (written, left_out, older)
+    if as_json:
+        _print_json([made], made, about_files, workspace.named)
+    _report([made], made, about_files, workspace.named, is_quiet=is_quiet)
 
 
 def _export_several(
@@ -221,6 +235,7 @@ def _export_several(
     choice: PointChoice,
     files: FileOptions,
     *,
+    is_quiet: bool,
     as_json: bool,
 ) -> None:
     from kgcp.errors import KgcpError
@@ -247,7 +262,10 @@ def _export_several(
         )
         written += more
         older = not_renewed(out, written)
-    _report(merged.parts, merged, (written, left_out, older), str, as_json=as_json)
+    about_files = (written, left_out, older)
+    if as_json:
+        _print_json(merged.parts, merged, about_files, str)
+    _report(merged.parts, merged, about_files, str, is_quiet=is_quiet)
 
 
 def _made(flights: Sequence[tuple[Flight, Path]], choice: PointChoice) -> list[GcpSet]:
@@ -297,12 +315,20 @@ def _report(
     files: tuple[list[Path], dict[str, str], tuple[str, ...]],
     named: Callable[[object], str],
     *,
-    as_json: bool,
+    is_quiet: bool,
 ) -> None:
-    """Report points, flights and files: those written, why some were not, and older ones."""
+    """Report points, flights and files: those written, why some were not, and older ones.
+
+    Parameters
+    ----------
+    is_quiet : bool
+        Report grave doubts only.
+    """
     written, left_out, older = files
-    if as_json:
-        _print_json(parts, whole, files, named)
+    if is_quiet:
+        for part in parts:
+            print_doubts(part.doubts, is_quiet=True)
+        return
     for part in parts:
         heading = f"{part.flight.name}: " if len(parts) > 1 else ""
         click.echo(f"{heading}{_counted(part)}", err=True)

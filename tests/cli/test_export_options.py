@@ -182,6 +182,17 @@ def test_no_page_says_that_a_doubted_flight_needs_no_correction(folder: Path) ->
     assert agreement(made.consistency, [doubt]).endswith("(RMS of 40 frames, 0 outliers).")
 
 
+def test_a_quiet_export_prints_grave_doubts_only(folder: Path) -> None:
+    toml = (folder / "flight.toml").read_text(encoding="utf-8")
+    wrong = toml.replace('crs = "EPSG:25831"', 'crs = "EPSG:31468"')
+    assert wrong != toml
+    (folder / "flight.toml").write_text(wrong, encoding="utf-8")
+    result = _export(folder, "--quiet", "--json")
+    graves = [each for each in json.loads(result.stdout)["doubts"] if each["severity"] == "grave"]
+    assert graves
+    assert result.stderr.count("kgcp: grave doubt: ") == len(graves) == result.stderr.count("\n")
+
+
 def test_the_summary_says_how_well_the_points_are_known(folder: Path) -> None:
     stderr = _export(folder).stderr
     with (folder / "kgcp" / "kgcps.csv").open(encoding="utf-8") as stream:
