@@ -330,8 +330,7 @@ def _report(
             print_doubts(part.doubts, is_quiet=True)
         return
     for part in parts:
-        heading = f"{part.flight.name}: " if len(parts) > 1 else ""
-        click.echo(f"{heading}{_counted(part)}", err=True)
+        click.echo(f"{_heading(part, parts)}{_counted(part)}", err=True)
         _report_part(part)
     if len(parts) > 1:
         click.echo(f"all {len(parts)} flights: {_counted(whole)}", err=True)
@@ -359,17 +358,26 @@ def _print_json(
         "checkpoints": sum(point.is_checkpoint for point in whole.gcps),
         "skipped": dict(_reasons(whole)),
         "advice": [
-            line
+            f"{_heading(part, parts)}{line}"
             for part in parts
             if part.consistency is not None
             for line in advice(part.consistency, part.doubts)
         ],
-        "doubts": [doubt.summary() for part in parts for doubt in part.doubts],
+        "doubts": [
+            {**doubt.summary(), "flight": part.flight.name}
+            for part in parts
+            for doubt in part.doubts
+        ],
         "files": [*map(named, written)],
         "left_out": left_out,
         "not_renewed": older,
     }
     click.echo(json.dumps(summary))
+
+
+def _heading(part: GcpSet, parts: Sequence[GcpSet]) -> str:
+    """Return the flight's name before what is said about one of several flights."""
+    return f"{part.flight.name}: " if len(parts) > 1 else ""
 
 
 def _reasons(points: GcpSet | MergedGcps) -> Counter[str]:

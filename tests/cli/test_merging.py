@@ -106,10 +106,15 @@ def test_two_flights_are_merged_into_one_set(
 ) -> None:
     north, south = two
     south.edit(("[-0.8, 0.15, -1.95]", "[-0.8, 0.65, -1.95]"))
+    (south.path / "frames" / FRAMES[0]).unlink()
     out = tmp_path / "block"
     result = export(north.path, south.path, "--out", out, "--format", "csv", "--json")
     assert result.exit_code == 0, result.stderr
-    assert json.loads(result.stdout)["kgcps"] == 8
+    summary = json.loads(result.stdout)
+    assert summary["kgcps"] == 8
+    assert [(each["flight"], each["code"]) for each in summary["doubts"]] == [
+        ("south bank", "unreadable")
+    ]
     assert "north: 4 KGCPs" in result.stderr
     assert "all 2 flights: 8 KGCPs, 0 sightings left out" in result.stderr
     points = pd.read_parquet(out / "kgcps.parquet")
