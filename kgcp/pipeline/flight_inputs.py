@@ -382,7 +382,7 @@ def missing_frames(flight: Flight, sightings: Sequence[Sighting]) -> tuple[Doubt
     return (
         mild(
             Cause.UNREADABLE,
-            f"{flight.frames_folder}: frames with the target that are no longer there:"
+            "frames with the target that are no longer in the folder of the frames:"
             f" {len(missing)} of {len(frames)} ({missing[0]}{', …' if len(missing) > 1 else ''})",
             "repeat 'kgcp detect' if they are not to be used",
         ),

@@ -109,11 +109,12 @@ def test_other_frames_are_refused(measured: SampleFlight) -> None:
     (frames / FRAMES[0]).unlink()
     partial = measured.run("export-gcp")
     assert partial.exit_code == 0
-    assert f"no longer there: 1 of 4 ({FRAMES[0]}); repeat 'kgcp detect'" in partial.stderr
-    frames.rename(measured.path / "archive")
-    assert "no longer there" not in measured.run("export-gcp").stderr, (
-        "frames may move to an archive"
+    doubt = f"folder of the frames: 1 of 4 ({FRAMES[0]}); repeat 'kgcp detect'"
+    assert f"doubt: frames with the target that are no longer in the {doubt}" in partial.stderr, (
+        "no path, which would make other bytes of consistency.json in another folder"
     )
+    frames.rename(measured.path / "archive")
+    assert "no longer in" not in measured.run("export-gcp").stderr, "frames may move to an archive"
     (measured.path / "archive").rename(frames)
     shutil.copy(frames / FRAMES[1], frames / FRAMES[0])
     changed = f"changed since 'kgcp detect': files of 1 frame ({FRAMES[0]}); "
