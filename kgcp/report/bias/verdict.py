@@ -162,7 +162,7 @@ def _contradictions(*, agrees: bool, doubt_count: int) -> Iterator[Finding]:
         )
         yield Finding(FlightGrade.LOOK, text, "consistency")
     elif doubt_count:
-        text = f"The inputs raise {counted(doubt_count, 'doubt')}, listed below."
+        text = f"The inputs raise {counted(doubt_count, 'doubt')}."
         yield Finding(FlightGrade.LOOK, text, "consistency")
 
 

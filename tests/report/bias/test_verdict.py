@@ -98,7 +98,7 @@ def test_a_flight_whose_points_are_wrong_is_not_good(fly: Fly) -> None:
     assert "Vehicle and camera do not put the target at the same place" in verdict.sentences[1]
     verdict = assess(fly(), doubt_count=2)
     assert verdict.grade is FlightGrade.LOOK
-    assert verdict.sentences[1] == "The inputs raise 2 doubts, listed below."
+    assert verdict.sentences[1] == "The inputs raise 2 doubts."
 
 
 def test_focal_length_and_lever_arm_are_named(fly: Fly) -> None:
