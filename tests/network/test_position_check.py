@@ -10,23 +10,40 @@ from kgcp.georef.target_positions import TargetPosition
 from kgcp.network.ground.frame_poses import UNSTATED_SCALE_SD, FramePose
 from kgcp.network.ground.point_images import CameraPose
 from kgcp.network.ground.position_check import WrongCamera, WrongPosition, wrong_input
+from kgcp.network.ground.target_moves import MovedTarget
 from tests.ground_flight import CAMERA, GroundFlight
 
 SD_PX, SD_DISTANCE = 0.005, 2e-4
 
 
 def checked(
-    targets: int, seed: int, *, off_m: float = 0.0, sd_m: float = 0.01, noise: float = 1.0
-) -> tuple[str, WrongPosition | None]:
-    """The target with a wrong height, and the result of the check; noise in stated deviations."""
+    targets: int,
+    seed: int,
+    *,
+    off_m: float = 0.0,
+    sd_m: float = 0.01,
+    noise: float = 1.0,
+    move_m: float = 0.0,
+    motion_px: float = 0.0,
+) -> tuple[str, WrongPosition | MovedTarget | None]:
+    """The target with a wrong height, and the result of the check; noise in stated deviations.
+
+    It is `move_m` further north in the second half of the frames. In each frame, the image moves by
+    some `motion_px` from the first row to the last.
+    """
     rng = np.random.default_rng(seed)
     names = tuple("ABCDEF"[:targets])
     offsets_m = rng.uniform(-4.0, 4.0, (targets, 3)) * [1.0, 1.0, 0.2]
     flight = GroundFlight(names, offsets_m, frames=6, seed=seed)
     sightings, poses = [], []
     for row, frame in enumerate(flight.frame_names):
-        seen = (flight.positions - flight.centres[row]) @ flight.rotations[row]
+        places = flight.positions.copy()
+        places[seed % targets, 1] += move_m * (row >= flight.frames // 2)
+        seen = (places - flight.centres[row]) @ flight.rotations[row]
         pixels = CAMERA.project(seen) + noise * SD_PX * rng.standard_normal((targets, 2))
+        if motion_px:
+            rows = pixels[:, 1:] / CAMERA.height - 0.5
+            pixels = pixels + rows * motion_px * rng.standard_normal(2)
         far_m = np.linalg.norm(seen, axis=1)
         far_m = far_m * (1.0 + noise * SD_DISTANCE * rng.standard_normal(targets))
         sightings += [
@@ -65,7 +82,7 @@ def test_the_wrong_position_is_named_among_few_others(
 ) -> None:
     """Four targets hardly show which of them is wrong, six do."""
     found = [checked(targets, seed, off_m=0.1) for seed in range(40)]
-    found_wrong = [(true, wrong) for true, wrong in found if wrong is not None]
+    found_wrong = [(true, wrong) for true, wrong in found if isinstance(wrong, WrongPosition)]
     assert len(found_wrong) >= 28
     assert all(true in wrong.targets for true, wrong in found_wrong)
     assert named[0] < float(np.mean([len(wrong.targets) for _, wrong in found_wrong])) < named[1]
@@ -83,9 +100,25 @@ def test_image_noise_other_than_stated_contradicts_no_position(sd_m: float, nois
 
 def test_a_wrong_position_is_found_with_images_worse_than_stated() -> None:
     found = [checked(6, seed, off_m=0.1, noise=10.0) for seed in range(12)]
-    found_wrong = [(true, wrong) for true, wrong in found if wrong is not None]
+    found_wrong = [(true, wrong) for true, wrong in found if isinstance(wrong, WrongPosition)]
     assert len(found_wrong) >= 11
     assert all(wrong.targets[0] == true for true, wrong in found_wrong)
     assert float(np.median([wrong.off_m for _, wrong in found_wrong])) == pytest.approx(
         0.1, rel=0.15
     )
+
+
+@pytest.mark.parametrize("targets", [4, 5])
+def test_a_move_of_three_deviations_is_found(targets: int) -> None:
+    """Frames show it, though they agree with the positions before and after."""
+    for seed in range(4):
+        target, found = checked(targets, seed, move_m=0.03)
+        assert isinstance(found, MovedTarget)
+        assert (found.target, found.frame) == (target, "f_003.png")
+        assert found.off_m == pytest.approx(0.03, abs=0.003)
+
+
+def test_a_moving_image_is_no_moved_target() -> None:
+    """A rolling shutter that is not declared looks like moves of all targets."""
+    found = [checked(5, seed, motion_px=3.0)[1] for seed in range(12)]
+    assert not any(isinstance(each, MovedTarget) for each in found)

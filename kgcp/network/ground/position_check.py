@@ -2,14 +2,15 @@
 
 In a single frame with few targets, the pose absorbs most of a wrong position or calibration. Frames
 from other directions contradict it. Therefore corrections of all positions and of the calibration
-are estimated from all frames, and compared with their standard deviations.
+are estimated from all frames, and compared with their standard deviations. So are two places of
+each target, before and after any of its frames.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from kgcp.measurement.systematic_errors import pose_by_calibration
 from kgcp.network.ground.frame_poses import NO_ROTATIONS, SD_FOCAL, FramePose, point_images
 from kgcp.network.ground.point_images import PointImages
 from kgcp.network.ground.pose_adjustment import calibration_slopes, position_equations
+from kgcp.network.ground.target_moves import FrameEquations, MovedTarget, moved_target
 
 _DOUBTFUL_CHI2 = 16.3  # limit of three coordinates; chance exceeds it once in 1000 targets
 _SAME_CHI2 = 13.8  # targets within this Δχ² of the worst one may be the wrong one instead
@@ -81,12 +83,14 @@ class WrongCamera:
 class _Equations:
     """Normal equations of corrections to n positions and the calibration, from all frames."""
 
+    names: Sequence[str]  # of the n targets
     normal: FloatArray  # (3 n + k, 3 n + k)
     right: FloatArray  # (3 n + k,)
     squares: float  # of the weighted residuals without corrections
     freedom: int
     prior_m2: FloatArray  # (3 n, 3 n): covariance of the positions
     oriented: Sequence[tuple[FramePose, PointImages, FloatArray]]  # with `_by_calibration`
+    frames: Sequence[FrameEquations]  # whose sum this is
 
     @property
     def positions(self) -> slice:
@@ -106,7 +110,7 @@ def wrong_input(
     camera: Camera,
     sd_scale: float,
     rotations: Mapping[str, SceneRotation] = NO_ROTATIONS,
-) -> WrongPosition | WrongCamera | None:
+) -> WrongPosition | MovedTarget | WrongCamera | None:
     """Return what the frames of a flight contradict most; None: nothing is doubtful.
 
     Parameters
@@ -117,21 +121,41 @@ def wrong_input(
     by_frame_and_target = {
         (each.frame, each.target): each for each in sightings if not each.instance
     }
-    of_frames = (pose.used for pose in poses if pose.residuals is not None)
-    names = list(dict.fromkeys(name for used in of_frames for name in used))
-    if not names:
+    oriented = [pose for pose in _in_time(poses, sightings) if pose.residuals is not None]
+    if not oriented:
         return None
-    equations = _equations(
-        poses, by_frame_and_target, positions, names, camera, sd_scale, rotations
+
+    def equations(of_frames: Sequence[FramePose]) -> _Equations:
+        return _equations(of_frames, by_frame_and_target, positions, camera, sd_scale, rotations)
+
+    agreeing = equations(oriented)
+    position: WrongPosition | MovedTarget | None = _wrong_position(agreeing)
+    # frames that show a target at its other place may have left it out
+    everything = equations([replace(pose, used=pose.targets) for pose in oriented])
+    moved = moved_target(
+        everything.frames,
+        everything.normal,
+        everything.right,
+        everything.squares,
+        everything.freedom - len(everything.normal),
     )
-    position = _wrong_position(equations, names)
-    wrong, chi2 = _wrong_camera(equations, camera)
+    if moved and not (position and position.chi2 > moved.chi2):
+        position = moved
+    wrong, chi2 = _wrong_camera(agreeing, camera)
     return wrong if wrong and not (position and position.chi2 > chi2) else position
 
 
-def _wrong_position(equations: _Equations, names: Sequence[str]) -> WrongPosition | None:
+def _in_time(poses: Sequence[FramePose], sightings: Sequence[Sighting]) -> Sequence[FramePose]:
+    """Return the frames in the order in which they were taken, if their times are known."""
+    time_s = {each.frame: each.time_s for each in sightings if each.time_s is not None}
+    if any(pose.targets and pose.frame not in time_s for pose in poses):
+        return poses
+    return sorted(poses, key=lambda pose: time_s.get(pose.frame, 0.0))
+
+
+def _wrong_position(equations: _Equations) -> WrongPosition | None:
     """Return the position that the frames contradict most; None: none is doubtful."""
-    places, prior = equations.positions, equations.prior_m2
+    names, places, prior = equations.names, equations.positions, equations.prior_m2
     normal, right = equations.normal[places, places], equations.right[places]
     # residuals that no corrections explain scale the noise of the images, but not the prior
     factor = equations.noise_factor(len(normal))
@@ -199,17 +223,17 @@ def _equations(
     poses: Sequence[FramePose],
     by_frame_and_target: Mapping[tuple[str, str], Sighting],
     positions: Mapping[str, TargetPosition],
-    names: Sequence[str],
     camera: Camera,
     sd_scale: float,
     rotations: Mapping[str, SceneRotation],
 ) -> _Equations:
+    names = list(dict.fromkeys(name for pose in poses for name in pose.used))
     count = 3 * len(names) + len(_CHECKED)
     normal, right = np.zeros((count, count)), np.zeros(count)
     squares, freedom = 0.0, 0
-    oriented = []
+    oriented, frames = [], []
     for pose in poses:
-        if pose.pose is None or pose.residuals is None:
+        if pose.pose is None:
             continue
         used = pose.used
         sightings = [by_frame_and_target[pose.frame, name] for name in used]
@@ -228,12 +252,13 @@ def _equations(
         squares += equations[2]
         freedom += 2 * len(used) + int(np.count_nonzero(images.has_distance)) - 6 - has_free_focal
         oriented.append((pose, images, by_calibration))
+        frames.append(FrameEquations(pose.frame, used, at, *equations[:2]))
     prior = np.zeros((3 * len(names), 3 * len(names)))
     for row, name in enumerate(names):
         cov = positions[name].cov_m2
         position_cov = _MIN_SD_M**2 * np.eye(3) + (0.0 if cov is None else cov)
         prior[3 * row : 3 * row + 3, 3 * row : 3 * row + 3] = position_cov
-    return _Equations(normal, right, squares, freedom, prior, oriented)
+    return _Equations(names, normal, right, squares, freedom, prior, oriented, frames)
 
 
 def _by_calibration(camera: Camera, sightings: Sequence[Sighting]) -> FloatArray:

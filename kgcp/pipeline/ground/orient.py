@@ -31,6 +31,7 @@ from kgcp.io.tables.provenance import derived_provenance
 from kgcp.network.ground.frame_poses import FramePose, orient_frames, print_scale_sd
 from kgcp.network.ground.position_check import WrongCamera, WrongPosition, wrong_input
 from kgcp.network.ground.resection import MIN_POINTS
+from kgcp.network.ground.target_moves import MovedTarget
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.number_text import amount, listed, rounded
@@ -71,15 +72,15 @@ class FlightPoses:
     local_frame : LocalFrame
     provenance : mapping of str
         The metadata of the table.
-    wrong_input : WrongPosition or WrongCamera or None
-        What the images contradict: a position, or the calibration; None: neither.
+    wrong_input : WrongPosition or MovedTarget or WrongCamera or None
+        What the images contradict: a position, its constancy, or the calibration; None: none.
     """
 
     flight: Flight
     poses: tuple[FramePose, ...]
     local_frame: LocalFrame
     provenance: Mapping[str, str]
-    wrong_input: WrongPosition | WrongCamera | None = None
+    wrong_input: WrongPosition | MovedTarget | WrongCamera | None = None
 
     @property
     def oriented(self) -> tuple[FramePose, ...]:
@@ -150,7 +151,7 @@ class FlightPoses:
             )
         return tuple(doubts)
 
-    def _contradiction(self, wrong: WrongPosition | WrongCamera) -> str:
+    def _contradiction(self, wrong: WrongPosition | MovedTarget | WrongCamera) -> str:
         """Return the sentence on what the images contradict."""
         if isinstance(wrong, WrongPosition):
             first, *others = wrong.targets
@@ -160,6 +161,13 @@ class FlightPoses:
                 + (f", or that of {' or '.join(others)} is wrong" if others else "")
                 + f" (χ² {wrong.chi2:.0f} of 3), or a diameter is wrong; poses may be off by more"
                 " than is stated"
+            )
+        if isinstance(wrong, MovedTarget):
+            return (
+                f"{wrong.target} was moved: from {wrong.frame} on, the frames see it"
+                f" {rounded(wrong.off_m)} m from where it was before; its points and the poses are"
+                " wrong before or after; make a flight of either part of the frames, each with the"
+                " position_m that it had, or without this target"
             )
         fitting = [
             f"{name} = {amount(value, sd)} instead of {getattr(self.flight.camera, name):g}"
@@ -171,6 +179,11 @@ class FlightPoses:
             + f"; poses are off by about {rounded(wrong.off_m)} m,"
             f" {wrong.off_sds:.0f} stated standard deviations; look whether the calibration is"
             " that of this camera, lens, zoom and focus"
+            + (
+                ", and whether motion_sd_deg_s covers how it moves"
+                if self.flight.camera.readout_s
+                else "; if its shutter is rolling, give readout_s"
+            )
         )
 
     @property
