@@ -197,7 +197,9 @@ def _by_other_targets(
         sightings,
         positions.static,
         flight.camera,
-        sd_scale=print_scale_sd(flight.all_targets),
+        sd_scale=print_scale_sd(
+            target for target in flight.all_targets if target.position_m is not None
+        ),
         rotations=data.scene_rotations,
     ):
         if oriented.pose is not None:

@@ -587,3 +587,25 @@ def test_the_example_in_the_documentation_runs(tmp_path: Path) -> None:
     assert (folder / "kgcp" / "places" / "kgcps.csv").exists()
     points = pd.read_parquet(folder / "kgcp" / "kgcps.parquet")
     assert sorted(set(points["id"])) == ["A", "B", "C", "D"]
+
+
+def test_a_target_on_a_vehicle_is_compared_with_its_trajectory(tmp_path: Path) -> None:
+    """D stands on a vehicle that does not move; its trajectory is 0.2 m off."""
+    flight = GroundFlight()
+    folder = flight.write(tmp_path / "flight", sd_position_m=0.005)
+    toml = folder / "flight.toml"
+    lines = toml.read_text(encoding="utf-8").splitlines()[:-2]  # without D's position
+    lines += ["[vehicle]", 'trajectory = "vehicle.csv"', "lever_arm_m = [0.0, 0.0, -2.0]"]
+    toml.write_text("\n".join(lines), encoding="utf-8")
+    east, north, up = (flight.positions_map[3] + [0.2, 0.0, -2.0]).tolist()
+    rest = f"{east},{north},{up},0,0,0,0.01,0.01,0.01"
+    names = "time,x,y,z,roll_deg,pitch_deg,heading_deg,sd_x,sd_y,sd_z"
+    epochs = [f"2026-06-16T08:15:{second:02d}Z,{rest}" for second in range(30)]
+    (folder / "vehicle.csv").write_text("\n".join((names, *epochs)), encoding="utf-8")
+    table = read_detections(folder / "kgcp" / "detections.parquet")
+    seconds = table["frame"].str.slice(2, 5).astype(int)
+    table["time"] = pd.Timestamp("2026-06-16T08:15:05Z") + pd.to_timedelta(seconds, unit="s")
+    write_rows(folder / "kgcp" / "detections.parquet", table)
+    result = run("orient", folder)
+    assert result.exit_code == 0, result.stderr
+    assert re.search(r"doubt: D on the vehicle is 0\.2\d? m beside .* of 12\)", result.stderr)

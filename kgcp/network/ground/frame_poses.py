@@ -116,12 +116,11 @@ class PlateAttitude:
 
 
 def print_scale_sd(targets: Iterable[AnyTarget]) -> float:
-    """Return `sd_scale` for `orient_frames` from the stated accuracy of the static targets' prints.
+    """Return `sd_scale` for `orient_frames` from the stated accuracy of targets' prints.
 
     It is the largest relative standard deviation of a diameter.
     """
-    static = [target for target in targets if target.position_m is not None]
-    shares = [target.sd_outer_diameter_m / target.outer_diameter_m for target in static]
+    shares = [target.sd_outer_diameter_m / target.outer_diameter_m for target in targets]
     return max(shares, default=0.0) if all(shares) else UNSTATED_SCALE_SD
 
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from kgcp.errors import KgcpError
+from kgcp.geometry.camera import Camera
 from kgcp.georef.crs import parse_crs
 from kgcp.georef.local_frame import LocalFrame
+from kgcp.georef.sighting import Sighting, unmistakable
+from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.io.files.atomic import write_bytes
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
@@ -32,6 +35,7 @@ from kgcp.network.ground.frame_poses import FramePose, orient_frames, print_scal
 from kgcp.network.ground.position_check import WrongCamera, WrongPosition, wrong_input
 from kgcp.network.ground.resection import MIN_POINTS
 from kgcp.network.ground.target_moves import MovedTarget
+from kgcp.network.ground.vehicle_check import VehicleOff, vehicle_off
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.number_text import amount, listed, rounded
@@ -74,6 +78,8 @@ class FlightPoses:
         The metadata of the table.
     wrong_input : WrongPosition or MovedTarget or WrongCamera or None
         What the images contradict: a position, its constancy, or the calibration; None: none.
+    vehicle_off : VehicleOff or None
+        How the target on the vehicle differs from its trajectory; None: as stated, or none.
     """
 
     flight: Flight
@@ -81,6 +87,7 @@ class FlightPoses:
     local_frame: LocalFrame
     provenance: Mapping[str, str]
     wrong_input: WrongPosition | MovedTarget | WrongCamera | None = None
+    vehicle_off: VehicleOff | None = None
 
     @property
     def oriented(self) -> tuple[FramePose, ...]:
@@ -134,6 +141,16 @@ class FlightPoses:
             )
         if self.wrong_input is not None:
             doubts.append(self._contradiction(self.wrong_input))
+        if self.vehicle_off is not None:
+            off = self.vehicle_off
+            doubts.append(
+                f"{off.target} on the vehicle is {rounded(off.beside_m)} m beside and"
+                f" {rounded(abs(off.above_m))} m {'above' if off.above_m > 0.0 else 'below'} its"
+                " place by the trajectory, as the frames show it among the static targets (median"
+                f" of {off.frames} frames that contradict it, of {off.compared}); check times,"
+                " lever_arm_m, and whether trajectory and position_m have one datum and epoch and"
+                " heights of one kind"
+            )
         if self.distance_scale is not None:
             share, sd = self.distance_scale
             if abs(share) > max(_MIN_SCALE, _SIGNIFICANT_SIGMAS * sd):
@@ -238,7 +255,8 @@ def orient_flight(
         If there is no static target, no crs, no frame of these names, or no frame can be oriented.
     """
     table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
-    if not any(target.position_m is not None for target in flight.all_targets):
+    static = [target for target in flight.all_targets if target.position_m is not None]
+    if not static:
         raise KgcpError(
             f"{flight.folder / 'flight.toml'}: no target is static; give position_m to the"
             " targets by which frames are to be oriented"
@@ -250,7 +268,7 @@ def orient_flight(
     data = FlightData(flight, frames)
     positions = data.target_positions
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
-    sd_scale = print_scale_sd(flight.all_targets)
+    sd_scale = print_scale_sd(static)
     rotations = data.scene_rotations
     with np.errstate(all="ignore"):  # trial poses may be absurd; results that are not finite fail
         poses = orient_frames(
@@ -264,6 +282,11 @@ def orient_flight(
             rotations=rotations,
         )
         wrong = wrong_input(poses, sightings, positions.static, flight.camera, sd_scale, rotations)
+        off = None
+        if not options.has_free_focal:  # with which distances would be others
+            on_vehicle = _on_vehicle(sightings, positions, flight.camera)
+            prints_sd = print_scale_sd(flight.all_targets)
+            off = vehicle_off(poses, on_vehicle, flight.camera, prints_sd)
     if not any(each.pose is not None for each in poses):
         reasons = Counter(each.reason for each in poses)
         reason, count = reasons.most_common(1)[0]
@@ -277,7 +300,24 @@ def orient_flight(
         "free_focal": options.has_free_focal,
     }
     provenance = derived_provenance(flight, table, choices, has_reference=False)
-    return FlightPoses(flight, tuple(poses), positions.local_frame, provenance, wrong)
+    return FlightPoses(flight, tuple(poses), positions.local_frame, provenance, wrong, off)
+
+
+def _on_vehicle(
+    sightings: Sequence[Sighting], positions: TargetPositions, camera: Camera
+) -> dict[str, tuple[Sighting, TargetPosition]]:
+    """Return the sightings of the target on the vehicle by frame, with its places."""
+    moving = [each for each in unmistakable(sightings) if each.target not in positions.static]
+    times_s = [each.row_time_s(camera) for each in moving]
+    try:
+        places = positions.positions([each.target for each in moving], times_s)
+    except KgcpError:  # no trajectory, or no times: frames are oriented without
+        return {}
+    return {
+        each.frame: (each, place)
+        for each, place in zip(moving, places, strict=True)
+        if isinstance(place, TargetPosition)
+    }
 
 
 def write_poses(poses: FlightPoses, folder: Path) -> tuple[Path, ...]:
