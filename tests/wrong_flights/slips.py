@@ -6,8 +6,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import rotation_from_opk
 from kgcp.quality.checks.doubt import Cause
 from tests.wrong_flights.flights import (
     CAMERA,
@@ -99,6 +101,13 @@ def _opk(change: Callable[[FloatArray], FloatArray]) -> Callable[[Flight], Fligh
         )
 
     return make
+
+
+def _roll_pitch_yaw(opk_deg: FloatArray) -> FloatArray:
+    """The same poses of cameras that look down; at 0, 0, 0 the top of the photo is north."""
+    photo_from_body = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    rotation = photo_from_body @ rotation_from_opk(opk_deg) @ photo_from_body
+    return Rotation.from_matrix(rotation).as_euler("ZYX", degrees=True)[:, ::-1]
 
 
 def _late(seconds: float) -> Callable[[Flight], Flight]:
@@ -261,6 +270,8 @@ WITH_REFERENCE: Mapping[str, Slip] = {
     "omega, phi, kappa in gon": _slip(_opk(lambda opk: opk / 0.9), Cause.ANGLE_UNIT),
     "kappa turned by 90": _slip(_reference(5, lambda kappa: kappa + 90.0), Cause.REFERENCE),
     "kappa of the opposite sign": _slip(_reference(5, lambda kappa: -kappa), Cause.REFERENCE),
+    "omega and phi exchanged": _slip(_opk(lambda opk: opk[:, [1, 0, 2]]), Cause.REFERENCE),
+    "roll, pitch, yaw for omega, phi, kappa": _slip(_opk(_roll_pitch_yaw), Cause.REFERENCE),
     "poses of another place": _slip(_reference(0, lambda x: x + 20_000.0), Cause.REFERENCE),
     "another datum": _slip(
         lambda one: _reference(1, lambda y: y - 2.1)(_reference(0, lambda x: x + 1.3)(one)),

@@ -18,6 +18,7 @@ from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, rotation_from_opk
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle import circle_planes
 from kgcp.geometry.conic import fit_ellipse
+from kgcp.georef.trajectory import ENU_FROM_NED, body_to_ned
 from kgcp.quality.checks.clock import clock_shifts_s
 from kgcp.quality.checks.course import READINGS
 from kgcp.quality.checks.doubt import Cause
@@ -303,7 +304,7 @@ def _of_reference() -> Iterator[Slip]:
             "reference",
             f"omega, phi, kappa of the reference poses seem to be in {unit}",
             "give them in degrees",
-            _with_opk(factor, (1.0, 1.0, 1.0)),
+            _with_angles(_opk_times(factor * np.eye(3))),
         )
     for signs, word in (
         ((1.0, 1.0, -1.0), "the sign of kappa"),
@@ -316,8 +317,22 @@ def _of_reference() -> Iterator[Slip]:
             f"{word} of the reference poses seem{'s' if word.startswith('the sign ') else ''}"
             " to be reversed",
             "give omega, phi, kappa of R = Rx(omega) Ry(phi) Rz(kappa), camera to map",
-            _with_opk(1.0, signs),
+            _with_angles(_opk_times(np.diag(signs))),
         )
+    yield Slip(
+        Cause.REFERENCE,
+        "reference",
+        "omega and phi of the reference poses seem to be exchanged",
+        "exchange the two columns",
+        _with_angles(_opk_times(np.eye(3)[[1, 0, 2]])),
+    )
+    yield Slip(
+        Cause.REFERENCE,
+        "reference",
+        "omega, phi, kappa of the reference poses seem to be roll, pitch and yaw",
+        "convert them, or name the adjustment's own file in [reference] poses",
+        _with_angles(_as_of_vehicle),
+    )
 
 
 def _with_turn(turn_deg: float) -> Callable[[Encounters], Encounters]:
@@ -325,14 +340,27 @@ def _with_turn(turn_deg: float) -> Callable[[Encounters], Encounters]:
     return lambda encounters: replace(encounters, enu_from_camera=encounters.enu_from_camera @ turn)
 
 
-def _with_opk(
-    factor: float, signs: tuple[float, float, float]
+def _with_angles(
+    map_from_photo: Callable[[FloatArray], FloatArray],
 ) -> Callable[[Encounters], Encounters]:
+    """Return the slip's reverse, by rotations (n, 3, 3) from the angles of the poses (n, 3)."""
+
     def undone(encounters: Encounters) -> Encounters:
         # the rotation from the map's axes to ENU does not depend on how the angles are read
         own = rotation_from_opk(encounters.opk_deg) @ CAMERA_FROM_PHOTO
         enu_from_map = encounters.enu_from_camera @ np.swapaxes(own, 1, 2)
-        other = rotation_from_opk(factor * np.array(signs) * encounters.opk_deg)
-        return replace(encounters, enu_from_camera=enu_from_map @ other @ CAMERA_FROM_PHOTO)
+        other = map_from_photo(encounters.opk_deg) @ CAMERA_FROM_PHOTO
+        return replace(encounters, enu_from_camera=enu_from_map @ other)
 
     return undone
+
+
+def _opk_times(factors: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return the rotations by omega, phi, kappa times a matrix (3, 3)."""
+    return lambda opk_deg: rotation_from_opk(opk_deg @ factors)
+
+
+def _as_of_vehicle(rpy_deg: FloatArray) -> FloatArray:
+    """Return rotations (n, 3, 3) of photos from roll, pitch, yaw; at 0, the top is in the north."""
+    # photos that look down have x right, y forward, z up, like ENU; vehicles have axes like NED
+    return np.asarray(ENU_FROM_NED @ body_to_ned(*rpy_deg.T) @ ENU_FROM_NED.T)
