@@ -12,6 +12,9 @@ from kgcp.measurement.records import CircleImage, Measurement
 
 _MAX_HEADING_VARIANCE_RAD2 = 1.0  # with a larger one, the heading counts as unknown
 
+CAMERA_SPEED_M_S = 10.0
+"""Assumed speed of the camera while a rolling shutter reads the frame, if it is not known."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:

@@ -370,7 +370,7 @@ def _marks(
             " places",
             option="places",
         )
-    static = {target.name for target in flight.all_targets if target.position_m is not None}
+    static = {target.name for target in flight.static_targets}
     marks = read_marks(places, set(frames), static, flight.camera)
     for frame, in_frame in marks.items():
         by_target = {mark.target: mark.place for mark in in_frame}

@@ -9,6 +9,7 @@ from pathlib import Path
 from kgcp.errors import KgcpError, KgcpWarning
 from kgcp.io.formats.exclusions import Exclusion
 from kgcp.io.tables.detections import read_detections
+from kgcp.quality.number_text import counted
 
 FrameAndTarget = tuple[str, str]
 """Frame and target."""
@@ -90,8 +91,8 @@ def _warn(unknown: Sequence[Exclusion]) -> None:
         shown = "; ".join(map(str, unknown[:_MAX_SHOWN]))
         more = f" and {len(unknown) - _MAX_SHOWN} more" if len(unknown) > _MAX_SHOWN else ""
         warnings.warn(
-            f"{len(unknown)} lines of the list of frames to leave out name no row of the"
-            f" detections ({shown}{more}); write frames as paths below the frames folder",
+            f"{counted(len(unknown), 'exclusion')} without a row in the detections ({shown}{more});"
+            " write frames as paths below the frames folder",
             KgcpWarning,
             stacklevel=3,
         )

@@ -291,8 +291,7 @@ class FlightInputs:
             places.append((self.trajectory.position_map, "the trajectory"))
         places += [
             (np.array([target.position_m]), f"the static target {target.name!r}")
-            for target in self.flight.all_targets
-            if target.position_m is not None
+            for target in self.flight.static_targets
         ]
         if self.reference_poses is not None and len(self.reference_poses.frames):
             places.append((self.reference_poses.position_map, "the reference poses"))

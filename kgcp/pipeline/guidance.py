@@ -145,7 +145,7 @@ def plain_by_results(
     """
     if not flight.plain_targets or flight.crs is None:
         return {}
-    static = {target.name for target in flight.all_targets if target.position_m is not None}
+    static = {target.name for target in flight.static_targets}
     tracks = PlainTracks(flight.plain_targets, time_s)
     rows: dict[str, int] = {}
     lacking: dict[int, set[str]] = {}
@@ -197,9 +197,7 @@ def _by_other_targets(
         sightings,
         positions.static,
         flight.camera,
-        sd_scale=print_scale_sd(
-            target for target in flight.all_targets if target.position_m is not None
-        ),
+        sd_scale=print_scale_sd(flight.static_targets),
         rotations=data.scene_rotations,
     ):
         if oriented.pose is not None:

@@ -16,8 +16,8 @@ from kgcp.pipeline.run_summary import DetectionSummary, SummaryBuilder
 from kgcp.quality.checks.doubt import Cause, grave, mild
 
 
-def _summary(table: Path) -> DetectionSummary:
-    return SummaryBuilder({}).summary(
+def _summary(table: Path, builder: SummaryBuilder | None = None) -> DetectionSummary:
+    return (builder or SummaryBuilder({})).summary(
         table=table,
         likely_cause=None,
         frames_not_chosen=0,
@@ -146,17 +146,7 @@ def test_each_reason_has_its_commonest_detail_and_a_remedy(
     ):
         miss = Miss("A", reason, detail)
         builder.add(FrameResult(f"{number}.jpg", None, ExposureSettings(), (miss,)))
-    summary = builder.summary(
-        table=tmp_path,
-        likely_cause=None,
-        frames_not_chosen=0,
-        learnt=None,
-        kept=0,
-        frames_without_attitude=0,
-        not_drawn=0,
-        guide_problem=None,
-        stages_s={},
-    )
+    summary = _summary(tmp_path, builder)
     assert summary.problem == (
         "no target was measured in any of 6 frames: 3 too_small (5.2 px of 6 px across); fly lower,"
         " use a larger target or search for smaller rings"

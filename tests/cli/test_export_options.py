@@ -166,7 +166,7 @@ def test_a_table_of_an_older_kgcp_can_be_used_and_is_named(folder: Path) -> None
 
 def test_programs_are_warned_of_exclusions_that_match_nothing(folder: Path) -> None:
     selection = Selection(excluded=(("f_00.jpg", ""), ("f_99.jpg", "A")))
-    with pytest.warns(KgcpWarning, match=r"1 lines .* name no row .*\(f_99.jpg, A\)"):
+    with pytest.warns(KgcpWarning, match=r"1 exclusion without a row .*\(f_99.jpg, A\)"):
         made = make_gcps(read_flight(folder), selection=selection)
     assert {each.frame for each in made.skipped} >= {"f_00.jpg"}
     written = export_gcps(made, (name for name in ["csv"]), folder / "other")  # type: ignore[arg-type]

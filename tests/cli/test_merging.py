@@ -68,7 +68,7 @@ def test_excluded_frames_are_counted_with_their_own_reason(
 def test_excluded_names_without_a_row_cause_a_warning(measured: SampleFlight) -> None:
     file = listed(measured.path, f"{FRAMES[0].upper()}\n{FRAMES[1]},B\n{FRAMES[2]}\n")
     result = measured.run("export-gcp", "--exclude", str(file), "--json")
-    assert "kgcp: warning: 2 lines of the list of frames to leave out name no row" in result.stderr
+    assert "kgcp: warning: 2 exclusions without a row in the detections" in result.stderr
     assert "JPG; frame_0002.jpg, B); write" in result.stderr
     assert json.loads(result.stdout)["skipped"] == {"excluded": 1}
     everything = "\n".join(FRAMES)

@@ -578,7 +578,7 @@ def test_the_principal_point_of_cropped_photographs_is_found_outside_them(cx: fl
 def test_a_diverging_principal_point_is_held_at_the_border_and_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """No photograph stands apart, and to look for one takes the most time."""
+    """None of them stands apart; the search for such ones, which takes long, is left out."""
     monkeypatch.setattr("kgcp.network.calibration.photographs_apart", lambda *_: ())
     made, border = views(camera=replace(CAMERA, cx=2399.9)), 1599.0
     result = calibrated(made)

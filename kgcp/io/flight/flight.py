@@ -93,6 +93,11 @@ class Flight:
         """Those with a code, then those without."""
         return (*self.targets, *self.plain_targets)
 
+    @property
+    def static_targets(self) -> tuple[AnyTarget, ...]:
+        """Those with stated positions."""
+        return tuple(target for target in self.all_targets if target.position_m is not None)
+
 
 def read_flight(folder: Path | str) -> Flight:
     """Read and validate the flight.toml of a flight folder.

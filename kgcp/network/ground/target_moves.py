@@ -16,9 +16,8 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.network.ground.moved_circle import LEAST_SIDE
 
 _FALSE_ALARM = 1e-7  # probability that one split of one target's frames seems to show two places
-_MIN_OFF_M = (
-    0.01  # of a move that is reported; what is left of other errors looks like smaller ones
-)
+# Smallest move that is reported. What is left of other errors looks like smaller ones.
+_MIN_OFF_M = 0.01
 # What a move must leave: images nearly as good as stated, or a small share of the misfit before. A
 # moving camera with a rolling shutter, for example, makes all targets seem to move a little.
 _LOW_VARIANCE, _MOST = 4.0, 0.75

@@ -1,7 +1,7 @@
 """Comparison of a target on a vehicle with the static targets by which frames are oriented.
 
-The frames show where the vehicle's target is among the static ones. What the poses have wrong
-alike in position and rotation cancels, so that this is more certain than the poses themselves.
+The frames show where the vehicle's target is among the static ones. Errors of a pose's position and
+rotation nearly cancel there, so that this place is more certain than the poses themselves.
 """
 
 from __future__ import annotations
@@ -14,16 +14,15 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.camera import Camera
-from kgcp.georef.sighting import Sighting
+from kgcp.georef.sighting import CAMERA_SPEED_M_S, Sighting
 from kgcp.georef.target_positions import TargetPosition
 from kgcp.network.ground.frame_poses import FramePose
 
 _MAX_SDS = 5.0  # of an offset in one frame
-_MIN_OFF_M = 0.03
+_MIN_OFF_M = 0.03  # of an offset that counts
 _MIN_SHARE, _MIN_FRAMES = 0.25, 2  # of the frames that are compared, that must be off
 _UNSTATED_SD_M = 0.1  # of a trajectory without standard deviations
 _CALIBRATION_SD_PX = 0.5  # of a place relative to those of the static targets
-_SPEED_M_S = 10.0  # of the camera, while a rolling shutter reads the frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,7 +101,7 @@ def _offset(
     by_pose = np.hstack((np.eye(3), -cross_matrix(sight_m)))
     share = max(sd_scale, (sighting.sd_common_distance_m or 0.0) / sighting.distance_m)
     sd_m = _CALIBRATION_SD_PX * sighting.distance_m / camera.mean_focal_px
-    shift_m = _SPEED_M_S * camera.readout_s * sighting.rows_since_middle(camera)
+    shift_m = CAMERA_SPEED_M_S * camera.readout_s * sighting.rows_since_middle(camera)
     own = position.cov_m2
     cov = (
         by_pose @ pose.cov @ by_pose.T

@@ -77,9 +77,11 @@ class FlightPoses:
     provenance : mapping of str
         The metadata of the table.
     wrong_input : WrongPosition or MovedTarget or WrongCamera or None
-        What the images contradict: a position, its constancy, or the calibration; None: none.
+        What the images contradict: a position, that a target stayed there, or the calibration;
+        None: nothing.
     vehicle_off : VehicleOff or None
-        How the target on the vehicle differs from its trajectory; None: as stated, or none.
+        By how much the target on the vehicle is off its trajectory; None: not noticeably, or there
+        is no such target.
     """
 
     flight: Flight
@@ -183,8 +185,8 @@ class FlightPoses:
             return (
                 f"{wrong.target} was moved: from {wrong.frame} on, the frames see it"
                 f" {rounded(wrong.off_m)} m from where it was before; its points and the poses are"
-                " wrong before or after; make a flight of either part of the frames, each with the"
-                " position_m that it had, or without this target"
+                " wrong before or after; process the frames before and after as two flights, each"
+                " with the position_m of its time, or leave this target out"
             )
         fitting = [
             f"{name} = {amount(value, sd)} instead of {getattr(self.flight.camera, name):g}"
@@ -255,8 +257,7 @@ def orient_flight(
         If there is no static target, no crs, no frame of these names, or no frame can be oriented.
     """
     table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
-    static = [target for target in flight.all_targets if target.position_m is not None]
-    if not static:
+    if not flight.static_targets:
         raise KgcpError(
             f"{flight.folder / 'flight.toml'}: no target is static; give position_m to the"
             " targets by which frames are to be oriented"
@@ -268,7 +269,7 @@ def orient_flight(
     data = FlightData(flight, frames)
     positions = data.target_positions
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
-    sd_scale = print_scale_sd(static)
+    sd_scale = print_scale_sd(flight.static_targets)
     rotations = data.scene_rotations
     with np.errstate(all="ignore"):  # trial poses may be absurd; results that are not finite fail
         poses = orient_frames(
@@ -283,7 +284,7 @@ def orient_flight(
         )
         wrong = wrong_input(poses, sightings, positions.static, flight.camera, sd_scale, rotations)
         off = None
-        if not options.has_free_focal:  # with which distances would be others
+        if not options.has_free_focal:  # it would change all distances
             on_vehicle = _on_vehicle(sightings, positions, flight.camera)
             prints_sd = print_scale_sd(flight.all_targets)
             off = vehicle_off(poses, on_vehicle, flight.camera, prints_sd)
@@ -311,7 +312,7 @@ def _on_vehicle(
     times_s = [each.row_time_s(camera) for each in moving]
     try:
         places = positions.positions([each.target for each in moving], times_s)
-    except KgcpError:  # no trajectory, or no times: frames are oriented without
+    except KgcpError:  # no trajectory, or no times: nothing to compare with
         return {}
     return {
         each.frame: (each, place)

@@ -284,7 +284,7 @@ def _targets(flight: Flight, names: Sequence[str]) -> list[AnyTarget]:
         )
     if names:
         return [known[name] for name in dict.fromkeys(names)]
-    static = [target for target in flight.all_targets if target.position_m is not None]
+    static = list(flight.static_targets)
     if not static:
         raise KgcpError(
             f"{flight.folder / 'flight.toml'}: no target is static; give position_m to those"

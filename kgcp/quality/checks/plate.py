@@ -34,6 +34,7 @@ _MIN_GROWTH, _MIN_RATIO = 2e-3, 5.0
 # What may displace the inner edge in all frames alike, as an error of the tone curve does [px]
 _SD_EDGE_PX = 0.03
 _ROBUST_STEPS = 10
+_MEDIAN_CHI2 = 0.455  # of one degree of freedom
 
 
 def check_plates(targets: Sequence[AnyTarget]) -> Iterator[Doubt]:
@@ -129,7 +130,7 @@ def _common_growth(growth: FloatArray, radius_px: FloatArray) -> tuple[float, fl
     values: FloatArray = np.zeros(2)
     for _ in range(_ROBUST_STEPS):
         residual = seen - design @ values
-        variance = max(float(np.median(residual**2)) / 0.455, 1e-18)
+        variance = max(float(np.median(residual**2)) / _MEDIAN_CHI2, 1e-18)
         weight = 1.0 / (1.0 + residual**2 / (4.0 * variance))
         normal = (design * weight[:, None]).T @ design / variance
         normal[1, 1] += _SD_EDGE_PX**-2

@@ -16,7 +16,7 @@ from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.camera import Camera
 from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.local_frame import LocalFrame
-from kgcp.georef.sighting import Sighting, unmistakable
+from kgcp.georef.sighting import CAMERA_SPEED_M_S, Sighting, unmistakable
 from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
 from kgcp.quality.number_text import listed, rounded
@@ -27,7 +27,6 @@ _CONTRADICTION_SDS = 5.0
 _MIN_SHARE, _MIN_FRAMES = 0.25, 2  # of the frames with two targets, that must contradict
 _PRINT_SD = 0.005  # relative, of distances from the camera, unless a larger one is stated
 _OTHER_SD_M = 0.002  # of a distance, by all other errors
-_SPEED_M_S = 10.0  # of the camera, while a rolling shutter reads the frame
 _MAX_LOG_SCALE = 0.02  # of a common factor of all distances
 _MIN_PAIRS = 3  # of targets, that distinguish a common factor from a wrong position
 _MAX_NAMED = 3  # measurements in a message
@@ -203,7 +202,7 @@ def _place_cov(
         cov = cov + orientations.cov_m2[row]
         cov = cov + math.radians(float(poses.sd_angle_deg[row])) ** 2 * across
     rows = sighting.rows_since_middle(camera)
-    shift_m = _SPEED_M_S * camera.readout_s * rows
+    shift_m = CAMERA_SPEED_M_S * camera.readout_s * rows
     variance = _OTHER_SD_M**2 + (sd_px * distance_m / camera.mean_focal_px) ** 2 + shift_m**2
     return np.asarray(cov + variance * np.eye(3))
 
@@ -282,7 +281,7 @@ def _pair(
     if not measured_m > 0.0:
         return None
     rows = second.rows_since_middle(camera) - first.rows_since_middle(camera)
-    variance = _OTHER_SD_M**2 + (_SPEED_M_S * camera.readout_s * rows) ** 2
+    variance = _OTHER_SD_M**2 + (CAMERA_SPEED_M_S * camera.readout_s * rows) ** 2
     along = between / measured_m
     for sighting, pose in ((first, first.pose), (second, second.pose)):
         share = max(_PRINT_SD, (sighting.sd_common_distance_m or 0.0) / sighting.distance_m)
