@@ -25,6 +25,9 @@ class ReferencePoses:
     sd_position_m: FloatArray | None
     # (n,): standard deviation of each of the three angles [deg]; None if not given
     sd_angle_deg: FloatArray | None
+    # (n, 6, 6): covariances of position [m] and left rotation vector [rad], the map's axes; None if
+    # not given: errors of positions and angles count as uncorrelated
+    cov: FloatArray | None = None
 
 
 def rotation_from_opk(opk_deg: FloatArray) -> FloatArray:
@@ -54,6 +57,30 @@ def rotation_onto(points: FloatArray, others: FloatArray) -> FloatArray:
     left, _, right = np.linalg.svd(after.T @ before)
     proper = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))])
     return np.asarray(left @ proper @ right)
+
+
+def turned_covariance(axes: FloatArray, cov: FloatArray) -> FloatArray:
+    """Return covariances (n, 6, 6) of pairs of vectors in other axes: A v for axes A (n, 3, 3)."""
+    both = np.zeros((len(axes), 6, 6))
+    both[:, :3, :3] = both[:, 3:, 3:] = axes
+    return np.asarray(both @ cov @ np.swapaxes(both, 1, 2))
+
+
+def place_covariances(pose_cov: FloatArray, sight: FloatArray) -> FloatArray:
+    """Return the covariances (n, 3, 3) that poses give to places in sight.
+
+    With R' = exp(ω) R and C' = C + δ, a place C + s moves by δ + ω × s.
+
+    Parameters
+    ----------
+    pose_cov : (n, 6, 6) array
+        Of projection centre and left rotation vector [rad].
+    sight : (n, 3) array
+        From the projection centres to the places, in the same axes and unit.
+    """
+    identity = np.broadcast_to(np.eye(3), (len(sight), 3, 3))
+    by_error = np.concatenate((identity, -cross_matrix(sight)), axis=2)
+    return np.asarray(by_error @ pose_cov @ np.swapaxes(by_error, 1, 2))
 
 
 def down_in_camera(opk_deg: FloatArray) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -12,7 +13,9 @@ from kgcp.geometry.attitude import (
     CAMERA_FROM_PHOTO,
     ReferencePoses,
     covariance_along,
+    place_covariances,
     rotation_from_opk,
+    turned_covariance,
 )
 from kgcp.geometry.camera import Camera
 from kgcp.georef.local_frame import LocalFrame
@@ -28,20 +31,56 @@ class ExteriorOrientations:
     centre_m: FloatArray  # (n, 3): projection centres in the ENU frame [m]
     # (n, 3, 3): camera axes (x right, y down, z forward) in the ENU frame, as columns
     enu_from_camera: FloatArray
-    # (n, 3, 3): covariances of the centres in ENU axes [m²]; None: the poses have no standard
-    # deviations
+    # (n, 3, 3): covariances of the centres in ENU axes [m²]; None: the poses do not state them
     cov_m2: FloatArray | None
+    # (n, 6, 6): covariances of the centres [m] and of left rotation vectors [rad], ENU axes; what
+    # the poses do not state counts as exact; None: they state nothing
+    cov: FloatArray | None
+    states_angles: bool  # whether `cov` has the accuracy of the attitudes
 
     @classmethod
     def of(cls, poses: ReferencePoses, local_frame: LocalFrame) -> Self:
         """Transform reference poses from the map into the ENU frame."""
         centre = local_frame.enu_from_map(poses.position_map)
         enu_from_map = local_frame.grid_rotation(centre)
-        sd = poses.sd_position_m
-        cov = None if sd is None else covariance_along(enu_from_map, sd)
         # CAMERA_FROM_PHOTO = diag(1, -1, -1) is its own inverse
         enu_from_camera = enu_from_map @ rotation_from_opk(poses.opk_deg) @ CAMERA_FROM_PHOTO
-        return cls(centre, enu_from_camera, cov)
+        cov = _stated_covariance(poses, enu_from_map)
+        states_centres = poses.cov is not None or poses.sd_position_m is not None
+        return cls(
+            centre,
+            enu_from_camera,
+            cov_m2=cov[:, :3, :3] if cov is not None and states_centres else None,
+            cov=cov,
+            states_angles=poses.cov is not None or poses.sd_angle_deg is not None,
+        )
+
+    def place_covariances(self, rows: Sequence[int], sight_m: FloatArray) -> FloatArray:
+        """Return the covariances (n, 3, 3) that the orientations give to places in sight [m²].
+
+        Parameters
+        ----------
+        rows : sequence of int
+            Which orientations.
+        sight_m : (n, 3) array
+            From the projection centres to the places, ENU axes.
+        """
+        if self.cov is None:
+            return np.zeros((len(sight_m), 3, 3))
+        return place_covariances(self.cov[[*rows]], sight_m)
+
+
+def _stated_covariance(poses: ReferencePoses, enu_from_map: FloatArray) -> FloatArray | None:
+    if poses.cov is not None:
+        return turned_covariance(enu_from_map, poses.cov)
+    if poses.sd_position_m is None and poses.sd_angle_deg is None:
+        return None
+    cov = np.zeros((len(enu_from_map), 6, 6))
+    if poses.sd_position_m is not None:
+        cov[:, :3, :3] = covariance_along(enu_from_map, poses.sd_position_m)
+    if poses.sd_angle_deg is not None:
+        cov[:, 3:, 3:] = np.radians(poses.sd_angle_deg)[:, None, None] ** 2 * np.eye(3)
+    return cov
 
 
 def visible_pixel(camera: Camera, point_camera: FloatArray) -> FloatArray:

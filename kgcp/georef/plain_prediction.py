@@ -66,12 +66,9 @@ def reference_orientations(
     """Return reference poses by frame."""
     orientations = ExteriorOrientations.of(poses, local_frame)
     by_frame = {}
+    states_all = orientations.cov_m2 is not None and orientations.states_angles
     for row, frame in enumerate(poses.frames):
-        cov = None
-        if orientations.cov_m2 is not None and poses.sd_angle_deg is not None:
-            turn = math.radians(float(poses.sd_angle_deg[row])) ** 2 * np.eye(3)
-            zero = np.zeros((3, 3))
-            cov = np.block([[orientations.cov_m2[row], zero], [zero, turn]])
+        cov = orientations.cov[row] if orientations.cov is not None and states_all else None
         by_frame[frame] = FrameOrientation(
             orientations.centre_m[row], orientations.enu_from_camera[row], cov, "the reference"
         )

@@ -86,7 +86,7 @@ def study_consistency(
         return None
     orientations = ExteriorOrientations.of(poses, target_positions.local_frame)
     equations = ConsistencyEquations.of(
-        frames, orientations, poses, camera, target_positions.vehicle.settings.sd_time_s
+        frames, orientations, camera, target_positions.vehicle.settings.sd_time_s
     )
     outlier = find_outliers(
         -equations.design,

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.attitude import ReferencePoses, cross_matrix
+from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.georef.exterior_orientation import ExteriorOrientations
@@ -56,7 +56,6 @@ class ConsistencyEquations:
         cls,
         frames: Sequence[ComparedFrame],
         orientations: ExteriorOrientations,
-        poses: ReferencePoses,
         camera: Camera,
         sd_time_s: float,
     ) -> Self:
@@ -91,7 +90,7 @@ class ConsistencyEquations:
             axis=2,
         )
         correlated = np.array([_correlated_m2(frame.position) for frame in frames])
-        independent = _independent_m2(frames, orientations, poses, sight)
+        independent = _independent_m2(frames, orientations, sight)
         shift = sd_time_s * velocity
         independent = independent + shift[:, :, None] * shift[:, None, :]
         independent = independent + np.array(
@@ -129,7 +128,6 @@ def _interpolation_m2(position: TargetPosition) -> FloatArray:
 def _independent_m2(
     frames: Sequence[ComparedFrame],
     orientations: ExteriorOrientations,
-    poses: ReferencePoses,
     sight: FloatArray,
 ) -> FloatArray:
     """Return the covariance (n, 3, 3) of reference poses and measured poses, in ENU axes."""
@@ -139,11 +137,9 @@ def _independent_m2(
     measured = [frame.sighting.pose_cov for frame in frames]
     of_pose = np.array([np.zeros((3, 3)) if cov is None else cov[:3, :3] for cov in measured])
     total = total + attitude @ of_pose @ np.swapaxes(attitude, 1, 2)
-    unstated = _UNSTATED_SD_M**2 * np.eye(3)
-    total = total + (unstated if orientations.cov_m2 is None else orientations.cov_m2[rows])
-    if poses.sd_angle_deg is not None:
-        effect = cross_matrix(sight) * np.radians(poses.sd_angle_deg[rows])[:, None, None]
-        total = total + effect @ np.swapaxes(effect, 1, 2)
+    total = total + orientations.place_covariances(rows, sight)
+    if orientations.cov_m2 is None:
+        total = total + _UNSTATED_SD_M**2 * np.eye(3)
     return np.asarray(total)
 
 

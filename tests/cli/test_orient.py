@@ -75,6 +75,32 @@ def test_frames_are_oriented_and_their_poses_place_targets(tmp_path: Path) -> No
         assert abs(target["diameter_residual_permille"]) < 1.0
 
 
+def test_a_target_is_placed_as_accurately_as_those_that_orient_the_frames(tmp_path: Path) -> None:
+    """A pose's errors of position and rotation nearly cancel where the targets are."""
+    corners = GroundFlight().offsets_m
+    flight = GroundFlight(tuple("ABCDE"), np.vstack((corners, [1.0, 0.5, 0.1])))
+    folder = flight.write(tmp_path / "flight")
+    rough = np.array([[0.0] * 3] * 4 + [[0.3, -0.2, 0.3]])
+    misplace(folder, flight, rough + np.random.default_rng(2).normal(0.0, 0.01, (5, 3)))
+    toml = folder / "flight.toml"
+    others, last = toml.read_text("utf-8").rsplit("sd_position_m", 1)
+    last = last.replace("[0.01, 0.01, 0.01]", "[0.5, 0.5, 0.5]")
+    toml.write_text(f"{others}sd_position_m{last}", encoding="utf-8")
+    assert run("orient", folder).exit_code == 0
+    poses = pd.read_csv(folder / "kgcp" / "poses.csv")
+    assert poses["sd_x"].min() > 0.03
+    placed = run("place", folder, "--poses", folder / "kgcp" / "poses.csv", "--json")
+    summary = json.loads(placed.stdout)
+    assert summary["doubts"] == []
+    for each in summary["targets"]:
+        assert abs(each["diameter_m"] - 0.9) < 3.0 * each["sd_diameter_m"] < 4.5e-3
+    target = summary["targets"][4]
+    off_m = np.array(target["position"]) - flight.positions_map[4]
+    assert target["target"] == "E"
+    assert (np.array(target["sd_position_m"])[:2] < 0.015).all()
+    assert (np.abs(off_m) < 3.0 * np.array(target["sd_position_m"])).all()
+
+
 def poses_of(folder: Path, flight: GroundFlight) -> tuple[np.ndarray, np.ndarray]:
     """Errors and standard deviations (n, 3) of the frames' places [m]."""
     poses = pd.read_parquet(folder / "kgcp" / "poses.parquet")

@@ -78,8 +78,14 @@ class CsvColumns:
         """Return columns (n, len(names)) by name."""
         return self.numbers[:, [self.names.index(name) for name in names]]
 
-    def deviations(self, names: Sequence[str]) -> FloatArray | None:
-        """Return optional columns of standard deviations; None if the file has none of them."""
+    def optional_block(self, names: Sequence[str]) -> FloatArray | None:
+        """Return optional columns (n, len(names)); None if the file has none of them.
+
+        Raises
+        ------
+        KgcpError
+            If the file has only some of them.
+        """
         present = [name for name in names if name in self.names]
         if not present:
             return None
@@ -89,7 +95,13 @@ class CsvColumns:
                 f"{self.path}, line 1: has {', '.join(present)} but not {', '.join(absent)};"
                 " give all of them or none"
             )
-        block = self.block(names)
+        return self.block(names)
+
+    def deviations(self, names: Sequence[str]) -> FloatArray | None:
+        """Return optional columns of standard deviations; None if the file has none of them."""
+        block = self.optional_block(names)
+        if block is None:
+            return None
         negative = np.argwhere(block < 0.0)
         if negative.size:
             row, column = negative[0]

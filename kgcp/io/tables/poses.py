@@ -12,6 +12,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, opk_from_rotation
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.io.files.csv_text import DEGREE_DECIMALS, csv_text
+from kgcp.io.formats.orientations.csv import COVARIANCE_COLUMNS, covariance_cells
 from kgcp.io.tables.columns import (
     BOOLEAN,
     INTEGER,
@@ -142,7 +143,14 @@ def pose_residuals(poses: Sequence[FramePose]) -> Iterator[PoseResidual]:
             yield PoseResidual(pose.frame, name, name in pose.used, residual, float(chi2))
 
 
-POSE_CSV_HEADER = ("frame", *_AXES, *_ANGLES, *(f"sd_{axis}" for axis in _AXES), "sd_angle_deg")
+POSE_CSV_HEADER = (
+    "frame",
+    *_AXES,
+    *_ANGLES,
+    *(f"sd_{axis}" for axis in _AXES),
+    "sd_angle_deg",
+    *COVARIANCE_COLUMNS,
+)
 
 
 def pose_csv_cells(
@@ -161,7 +169,7 @@ def pose_csv_cells(
         In metres, or longitude and latitude in degrees and height in metres.
     opk_deg : (3,) array
     cov : (6, 6) array
-        Of position [m] and rotation vector [rad].
+        Of position [m] and left rotation vector [rad].
     """
     decimals = DEGREE_DECIMALS if is_geographic else 6
     x, y, z = position.tolist()
@@ -173,6 +181,7 @@ def pose_csv_cells(
         *(f"{angle:.9f}" for angle in opk_deg.tolist()),
         *(f"{sd:.6f}" for sd in np.sqrt(np.diag(cov)[:3]).tolist()),
         f"{_sd_angle_deg(cov):.7f}",
+        *covariance_cells(cov),
     ]
 
 

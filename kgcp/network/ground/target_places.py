@@ -229,7 +229,7 @@ def place_targets(
         For a rolling shutter: motion of the camera at each reference pose.
     """
     orientations = ExteriorOrientations.of(poses, local_frame)
-    exterior_cov = None if has_exact_poses else _exterior_cov(poses, orientations)
+    exterior_cov = None if has_exact_poses else orientations.cov
     rows = {frame: row for row, frame in enumerate(poses.frames)}
     skipped: dict[str, str] = {}
     usable, all_views, all_frames = [], [], []
@@ -341,18 +341,6 @@ def _too_few(
         f"measured in {len(of_target)} frames{besides}, {len(posed)} of them with a reference pose;"
         f" {min_frames} are needed"
     )
-
-
-def _exterior_cov(poses: ReferencePoses, orientations: ExteriorOrientations) -> FloatArray | None:
-    """Return the covariances (n, 6, 6) of positions [m] and rotations [rad] in the ENU frame."""
-    if orientations.cov_m2 is None and poses.sd_angle_deg is None:
-        return None
-    cov = np.zeros((len(poses.frames), 6, 6))
-    if orientations.cov_m2 is not None:
-        cov[:, :3, :3] = orientations.cov_m2
-    if poses.sd_angle_deg is not None:
-        cov[:, 3:, 3:] = np.radians(poses.sd_angle_deg)[:, None, None] ** 2 * np.eye(3)
-    return cov
 
 
 def _images(

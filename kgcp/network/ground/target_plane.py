@@ -19,7 +19,7 @@ import numpy as np
 from scipy import optimize
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
-from kgcp.geometry.attitude import cross_matrix
+from kgcp.geometry.attitude import cross_matrix, place_covariances
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle_image import (
     circle_derivatives,
@@ -234,8 +234,7 @@ def common_covariance(
 
     - errors of the calibration;
     - a displacement of edges by the same number of pixels in all images;
-    - a shift of all projection centres, with their mean covariance: how much of it is common is
-      unknown, and a block with few control points shifts as a whole;
+    - the orientations, see `_common_by_orientations`;
     - the common errors of `views`.
 
     Parameters
@@ -265,11 +264,36 @@ def common_covariance(
     by_edge = gain @ wider.ravel() * edge_sd_px
     common += np.outer(by_edge, by_edge)
     if kept.exterior_cov is not None:
-        common[:3, :3] += kept.exterior_cov[:, :3, :3].mean(axis=0)
+        common += _common_by_orientations(kept.exterior_cov, kept.camera_m, fit.circle)
     if kept.common_effects is not None:
         by_exterior = _moments_by_exterior(camera, kept, fit.circle)
         by_errors = gain @ (by_exterior @ kept.common_effects).reshape(-1, 6)
         common += by_errors @ by_errors.T
+    return common
+
+
+def _common_by_orientations(
+    exterior_cov: FloatArray, camera_m: FloatArray, circle: SpaceCircle
+) -> FloatArray:
+    """Return the covariance (6, 6) from errors that n orientations share.
+
+    How much of their errors is common is unknown, and a block with few control points shifts as a
+    whole. If nothing is known of correlations, the projection centres shift with their mean
+    covariance. Otherwise the orientations follow from points on the ground, whose common errors
+    have two effects. The circle shifts, as errors of centre and rotation together displace it, much
+    less than the centres. And with a wrong scale, all distances, and so the diameter, are wrong by
+    the same factor.
+    """
+    common = np.zeros((6, 6))
+    position_cov = exterior_cov[:, :3, :3]
+    if not exterior_cov[:, :3, 3:].any():
+        common[:3, :3] = position_cov.mean(axis=0)
+        return common
+    sight_m = circle.centre_m - camera_m
+    common[:3, :3] = place_covariances(exterior_cov, sight_m).mean(axis=0)
+    along_m4 = np.einsum("ni,nij,nj->n", sight_m, position_cov, sight_m)
+    scale_variance = float(np.mean(along_m4 / np.sum(sight_m**2, axis=1) ** 2))
+    common[5, 5] = scale_variance * circle.radius_m**2
     return common
 
 

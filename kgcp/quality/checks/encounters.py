@@ -82,6 +82,10 @@ class Encounters:
         row_times_s, used, plate_poses, rows_of_poses = zip(*posed, strict=True)
         row = [*rows_of_poses]
         orientations = ExteriorOrientations.of(poses, target_positions.local_frame)
+        enu_from_camera = orientations.enu_from_camera[row]
+        in_camera_m = np.array([pose.translation_m for pose in plate_poses])
+        sight_m = np.einsum("nij,nj->ni", enu_from_camera, in_camera_m)
+        by_poses_m2 = orientations.place_covariances(row, sight_m)
         time_s = np.array(row_times_s) + vehicle.settings.time_offset_s
         draft = cls(
             vehicle=vehicle,
@@ -91,12 +95,12 @@ class Encounters:
             attitude_deg=np.empty((0, 3)),
             lever_arm_m=np.array(vehicle.settings.lever_arm_m),
             pixel=np.array([sighting.centre_px for sighting in used]),
-            in_camera_m=np.array([pose.translation_m for pose in plate_poses]),
+            in_camera_m=in_camera_m,
             camera_from_plate=np.array([pose.rotation for pose in plate_poses]),
             centre_m=orientations.centre_m[row],
-            enu_from_camera=orientations.enu_from_camera[row],
+            enu_from_camera=enu_from_camera,
             opk_deg=poses.opk_deg[row],
-            variance_m2=_variance_m2(used, vehicle, poses, row, time_s),
+            variance_m2=_variance_m2(used, vehicle, by_poses_m2, time_s),
             frame_from_ned=np.broadcast_to(ENU_FROM_NED, (len(row), 3, 3)),
         )
         place = draft.at(time_s).position_m
@@ -179,13 +183,14 @@ def misfit_of(offset_m: FloatArray, variance_m2: FloatArray) -> float:
 def _variance_m2(
     sightings: Sequence[Sighting],
     vehicle: Vehicle,
-    poses: ReferencePoses,
-    row: list[int],
+    by_poses_m2: FloatArray,
     time_s: FloatArray,
 ) -> FloatArray:
-    """Return variances (n,) [m²], as if each error were the same in all directions."""
+    """Return variances (n,) [m²], as if each error were the same in all directions.
+
+    `by_poses_m2` (n, 3, 3) are the covariances of the targets' places by the reference poses.
+    """
     settings, motion = vehicle.settings, vehicle.motion
-    distance = np.array([sighting.distance_m for sighting in sightings])
     total = np.full(len(sightings), _MIN_SD_M**2)
     for sds in (
         [sighting.sd_distance_m or 0.0 for sighting in sightings],
@@ -196,10 +201,7 @@ def _variance_m2(
     if motion.sd_position_m is not None:
         worst_m = motion.sd_position_m.max(axis=1)
         total += np.interp(time_s, motion.time_s, worst_m) ** 2  # large while GNSS is out
-    if poses.sd_position_m is not None:
-        total += poses.sd_position_m[row].max(axis=1) ** 2
-    if poses.sd_angle_deg is not None:
-        total += (np.radians(poses.sd_angle_deg[row]) * distance) ** 2
+    total += np.diagonal(by_poses_m2, axis1=1, axis2=2).max(axis=1)
     way = np.linalg.norm(np.diff(motion.position_m, axis=0), axis=1).sum()
     speed = float(way) / float(motion.time_s[-1] - motion.time_s[0])
     return total + (settings.sd_time_s * speed) ** 2

@@ -158,7 +158,7 @@ def check_places(
             axes = orientations.enu_from_camera[row]
             sight_m = axes @ each.pose.translation_m
             offsets_m[each.target].append(orientations.centre_m[row] + sight_m - place.position_m)
-            cov = _place_cov(each, sight_m, axes, poses, orientations, row, camera)
+            cov = _place_cov(each, sight_m, orientations, row, camera)
             covs_m2[each.target].append(cov + (0.0 if place.cov_m2 is None else place.cov_m2))
     off_m = {
         name: np.median(offsets, axis=0)
@@ -178,8 +178,6 @@ def check_places(
 def _place_cov(
     sighting: Sighting,
     sight_m: FloatArray,
-    enu_from_camera: FloatArray,
-    poses: ReferencePoses,
     orientations: ExteriorOrientations,
     row: int,
     camera: Camera,
@@ -193,14 +191,13 @@ def _place_cov(
     along = np.outer(sight_m, sight_m)
     cov = share**2 * along
     if sighting.pose_cov is not None:
+        enu_from_camera = orientations.enu_from_camera[row]
         cov = cov + enu_from_camera @ sighting.pose_cov[:3, :3] @ enu_from_camera.T
     sd_px = _CALIBRATION_SD_PX
-    if orientations.cov_m2 is None or poses.sd_angle_deg is None:
+    if orientations.cov_m2 is None or not orientations.states_angles:
         sd_px = _UNSTATED_POSE_SD_PX
     else:
-        across = distance_m**2 * np.eye(3) - along
-        cov = cov + orientations.cov_m2[row]
-        cov = cov + math.radians(float(poses.sd_angle_deg[row])) ** 2 * across
+        cov = cov + orientations.place_covariances([row], sight_m[None])[0]
     rows = sighting.rows_since_middle(camera)
     shift_m = CAMERA_SPEED_M_S * camera.readout_s * rows
     variance = _OTHER_SD_M**2 + (sd_px * distance_m / camera.mean_focal_px) ** 2 + shift_m**2

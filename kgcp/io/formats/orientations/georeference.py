@@ -9,7 +9,7 @@ import numpy as np
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.attitude import ReferencePoses, opk_from_rotation
+from kgcp.geometry.attitude import ReferencePoses, opk_from_rotation, turned_covariance
 from kgcp.georef.crs import CRS_KEY, MAX_HEIGHT, geographic_of, parse_crs
 from kgcp.georef.local_frame import CrsTransform, LocalFrame
 from kgcp.io.files.safe_read import is_number
@@ -68,6 +68,7 @@ def on_the_map(
         opk_deg=opk_from_rotation(georeferenced.frame_from_photo).reshape(-1, 3),
         sd_position_m=georeferenced.sd_position_m,
         sd_angle_deg=georeferenced.sd_angle_deg,
+        cov=georeferenced.cov,
     )
 
 
@@ -159,4 +160,5 @@ def _on_flight_map(
         position=transform.positions(source.position),
         frame_from_photo=flight_from_source @ source.frame_from_photo,
         sd_position_m=sd,
+        cov=None if source.cov is None else turned_covariance(flight_from_source, source.cov),
     )

@@ -46,6 +46,8 @@ class SourcePoses:
     sd_position_m: FloatArray | None = None
     # (n,): of each of the three angles [deg]; None: not given
     sd_angle_deg: FloatArray | None = None
+    # (n, 6, 6): of position [m] and left rotation vector [rad], the map's axes; None: not given
+    cov: FloatArray | None = None
     # whether the names are already those of the flight's frames, not of another program
     has_our_names: bool = False
 

@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from kgcp.errors import KgcpError
-from kgcp.geometry.attitude import opk_from_rotation, rotation_from_opk
+from kgcp.geometry.attitude import opk_from_rotation, place_covariances, rotation_from_opk
+from kgcp.georef.exterior_orientation import ExteriorOrientations
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.io.formats.orientations import read_reference_poses
+from kgcp.io.formats.orientations.records import OrientationFileOptions
+from kgcp.io.tables.poses import POSE_CSV_HEADER, pose_csv_cells
 
 _HEADER = "frame,x,y,z,omega_deg,phi_deg,kappa_deg"
 
@@ -63,3 +67,64 @@ def test_opk_agrees_with_a_published_adjustment() -> None:
 def test_opk_angles_are_read_back_as_they_were_written() -> None:
     opk = np.array([[3.0, -4.0, 170.0], [-170.0, 60.0, -20.0]])
     np.testing.assert_allclose(opk_from_rotation(rotation_from_opk(opk)), opk, atol=1e-10)
+
+
+# A camera 30 m above the ground that only its view of the ground holds in place: its rotation errs
+# by 1 mrad, and its position makes up for that.
+_SIGHT = np.array([[0.0, 0.0, -30.0]])
+_ROTATION = np.array([[0.0, 30.0, 0.0], [-30.0, 0.0, 0.0], [0.0, 0.0, 0.0]])  # moves C by -ω × s
+_BY_ERROR = np.vstack(
+    (np.hstack((_ROTATION, np.eye(3))), np.hstack((np.eye(3), np.zeros((3, 3)))))
+) @ np.diag([1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.01])
+_COV = _BY_ERROR @ _BY_ERROR.T
+
+
+def _posed(tmp_path: Path, **cells: str) -> Path:
+    """A file as `kgcp orient` writes it, with one pose and some of its cells exchanged."""
+    place = np.array([448_000.0, 5_411_000.0, 300.0])
+    row = pose_csv_cells("a.jpg", place, np.array([1.0, -2.0, 30.0]), _COV)
+    row = [cells.get(name, cell) for name, cell in zip(POSE_CSV_HEADER, row, strict=True)]
+    return _write(tmp_path, ",".join(POSE_CSV_HEADER), ",".join(row))
+
+
+def test_covariances_of_poses_are_read_as_written(tmp_path: Path) -> None:
+    poses = read_reference_poses(_posed(tmp_path))
+    assert poses.cov is not None
+    assert poses.sd_position_m is not None
+    np.testing.assert_allclose(poses.cov[0], _COV, rtol=1e-8, atol=1e-15)
+    np.testing.assert_allclose(poses.sd_position_m[0], np.sqrt(np.diag(_COV))[:3], rtol=1e-8)
+    np.testing.assert_allclose(place_covariances(poses.cov, _SIGHT)[0], 1e-4 * np.eye(3), atol=1e-9)
+
+
+def test_covariances_follow_the_axes_into_other_coordinates(tmp_path: Path) -> None:
+    """The place below the camera is known to a centimetre in all of them: the errors cancel."""
+    options = OrientationFileOptions(crs="EPSG:25832")
+    poses = read_reference_poses(_posed(tmp_path), options, crs="EPSG:25831")
+    local_frame = LocalFrame.at("EPSG:25831", poses.position_map[0])
+    orientations = ExteriorOrientations.of(poses, local_frame)
+    below = orientations.place_covariances([0], _SIGHT)[0]
+    np.testing.assert_allclose(below, 1e-4 * np.eye(3), atol=1e-9)
+    assert orientations.cov_m2 is not None
+    assert np.sqrt(np.diag(orientations.cov_m2[0]))[:2] == pytest.approx([0.0316, 0.0316], rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("cells", "words"),
+    [
+        ({"sd_x": "0.1"}, "line 2: sd_x is 0.1, but 0.0316228 by cov_x_x to cov_rot_z_rot_z"),
+        ({"sd_angle_deg": "0"}, "line 2: sd_angle_deg is 0, but 0.0572958 by cov_x_x"),
+        ({"cov_x_rot_y": "-0.1"}, "line 2: cov_x_x to cov_rot_z_rot_z are no covariance"),
+        ({"cov_x_x": "-1e-3"}, "line 2: cov_x_x to cov_rot_z_rot_z are no covariance"),
+    ],
+)
+def test_a_contradictory_covariance_is_refused(
+    tmp_path: Path, cells: dict[str, str], words: str
+) -> None:
+    with pytest.raises(KgcpError, match=words):
+        read_reference_poses(_posed(tmp_path, **cells))
+
+
+def test_a_part_of_a_covariance_is_refused(tmp_path: Path) -> None:
+    path = _write(tmp_path, _HEADER + ",cov_x_x,cov_y_y", "a.jpg,1,2,3,4,5,6,0.1,0.1")
+    with pytest.raises(KgcpError, match="has cov_x_x, cov_y_y but not cov_x_y"):
+        read_reference_poses(path)
