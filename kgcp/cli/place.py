@@ -117,7 +117,8 @@ def command(
         files = [*map(workspace.named, written)]
         click.echo(json.dumps({**places.summary(), "files": files, "not_renewed": older}))
     for sentence in places.sentences:
-        click.echo(sentence, err=True)
+        if sentence not in places.doubts:
+            click.echo(sentence, err=True)
     for name, reason in places.placement.skipped.items():
         click.echo(f"not placed: {name}: {reason}", err=True)
     for doubt in places.doubts:

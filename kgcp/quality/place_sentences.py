@@ -15,6 +15,7 @@ from kgcp.quality.number_text import minus, rounded
 
 _MAX_RATIO = 3.0  # of a diameter's residual to its standard deviation
 _MAX_CHI2 = 14.2  # of three coordinates, as likely as 3 standard deviations of one
+_ROUGH_M = 10.0  # error of a position of unknown accuracy that is not doubted
 _ALIKE_SHARE = 0.2  # largest difference between errors that count as one, as a share of it
 _MIN_NOISE_PX = 0.005  # of additional noise that is reported
 
@@ -26,8 +27,13 @@ def has_other_diameter(placed: PlacedTarget) -> bool:
 
 def lies_elsewhere(placed: PlacedTarget) -> bool:
     """Tell whether a target's position contradicts flight.toml."""
-    chi2 = placed.check.position_chi2
-    return chi2 is not None and chi2 > _MAX_CHI2
+    check = placed.check
+    chi2 = check.position_chi2
+    if chi2 is None or check.residual_m is None:
+        return False
+    if check.is_rough:
+        return float(np.linalg.norm(check.residual_m)) > _ROUGH_M
+    return chi2 > _MAX_CHI2
 
 
 def _diameter_ratio(placed: PlacedTarget) -> float:
@@ -73,12 +79,21 @@ def position_sentence(placed: PlacedTarget) -> str:
     if check.residual_m is None or chi2 is None:
         return f"{placed.target}: flight.toml states no position"
     x, y, z = (minus(f"{value:+.4f}") for value in check.residual_m.tolist())
+    lies = f"{placed.target}: lies {x}, {y}, {z} m (x, y, z) from its position in flight.toml"
     is_doubtful = lies_elsewhere(placed)
+    if check.is_rough:
+        remedy = "; check position_m and crs" if is_doubtful else ""
+        return f"{lies}, which states no sd_position_m{remedy}"
     verdict = "more than the standard deviations explain" if is_doubtful else "as expected"
-    return (
-        f"{placed.target}: lies {x}, {y}, {z} m (x, y, z) from its position in flight.toml,"
-        f" {verdict} (χ² = {chi2:.1f} for 3 coordinates)"
-    )
+    return f"{lies}, {verdict} (χ² = {chi2:.1f} for 3 coordinates)"
+
+
+def contradictions(placed: PlacedTarget) -> Iterator[str]:
+    """Yield the sentences on what contradicts flight.toml."""
+    if has_other_diameter(placed):
+        yield diameter_sentence(placed)
+    if lies_elsewhere(placed):
+        yield position_sentence(placed)
 
 
 def doubts_of(placed: PlacedTarget) -> Iterator[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
@@ -62,6 +63,35 @@ def test_targets_are_placed_and_their_diameters_measured(tmp_path: Path) -> None
     assert summary["sentences"][0] in page
     assert 'class="verdict look"' in page
     assert page.count('<li class="look">') == 5, "the diameters, that they agree, and no place"
+
+
+@pytest.mark.usefixtures("_no_figures")
+@pytest.mark.parametrize(
+    ("sd_position_m", "off_m", "words"),
+    [
+        (0.01, 0.0, None),
+        (0.01, 0.2, r"B: lies [+−]?0.0\d+, \+0.20\d+, .* from its position in .*, more than"),
+        (0.0, 0.2, None),  # a rough position
+        (0.0, 20.0, "B: lies .* which states no sd_position_m; check position_m and crs"),
+    ],
+)
+def test_positions_that_contradict_the_images_are_doubts(
+    tmp_path: Path, sd_position_m: float, off_m: float, words: str | None
+) -> None:
+    flight = GroundFlight()
+    folder = flight.write(tmp_path / "flight", sd_position_m=sd_position_m)
+    toml = folder / "flight.toml"
+    x, y, z = flight.positions_map[1].tolist()
+    text = toml.read_text(encoding="utf-8")
+    toml.write_text(text.replace(str([x, y, z]), str([x, y - off_m, z])), encoding="utf-8")
+    result = run(folder, "--json")
+    doubts = json.loads(result.stdout)["doubts"]
+    if words is None:
+        assert doubts == []
+    else:
+        (doubt,) = doubts
+        assert re.search(words, doubt)
+        assert result.stderr.count(doubt) == 1
 
 
 @pytest.mark.usefixtures("_no_figures")

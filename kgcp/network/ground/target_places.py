@@ -164,6 +164,7 @@ class PlaceCheck:
     # (3,): placed minus stated, in the map's axes [m]; None: flight.toml states no position
     residual_m: FloatArray | None
     cov_m2: FloatArray | None  # (3, 3): its covariance, including that of the stated position
+    is_rough: bool  # whether the accuracy of the stated position is unknown
     stated_diameter_m: float
     diameter_residual_m: float  # placed minus stated
     sd_diameter_residual_m: float
@@ -452,17 +453,19 @@ def _check(
     local_frame: LocalFrame,
 ) -> PlaceCheck:
     """Compare a circle with the stated position and diameter of its target."""
-    residual, residual_cov = None, None
+    residual, residual_cov, is_rough = None, None, True
     if target.position_m is not None:
         stated = static_position(target.position_m, target, local_frame)
         residual = enu_from_map.T @ (circle.centre_m - stated.position_m)
         residual_cov = cov[:3, :3]
         if stated.cov_m2 is not None:
+            is_rough = False
             residual_cov = residual_cov + enu_from_map.T @ stated.cov_m2 @ enu_from_map
     diameter_m = target.outer_diameter_m
     return PlaceCheck(
         residual,
         residual_cov,
+        is_rough,
         diameter_m,
         2.0 * circle.radius_m - diameter_m,
         math.hypot(2.0 * math.sqrt(cov[5, 5]), target.sd_outer_diameter_m),

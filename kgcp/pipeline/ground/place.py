@@ -41,6 +41,7 @@ from kgcp.pipeline.frame_priors import motions_while_read
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.place_sentences import (
     common_diameter_sentence,
+    contradictions,
     diameter_sentence,
     doubts_of,
     motion_sentence,
@@ -117,9 +118,14 @@ class FlightPlaces:
     @property
     def doubts(self) -> tuple[str, ...]:
         """Warnings to consider before the places are used."""
-        doubts = [doubt for placed in self.placement.targets for doubt in doubts_of(placed)]
+        placed_targets = self.placement.targets
+        doubts = [
+            doubt
+            for placed in placed_targets
+            for doubt in (*contradictions(placed), *doubts_of(placed))
+        ]
         of_all = (
-            common_diameter_sentence(self.placement.targets),
+            common_diameter_sentence(placed_targets),
             step_sentence(self.placement),
             noise_sentence(self.placement),
             motion_sentence(self.motions, self.flight.camera),

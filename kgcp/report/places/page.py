@@ -37,8 +37,10 @@ def render_places(page: PlacesPage) -> str:
             (position_sentence(placed), lies_elsewhere(placed)),
         )
     ]
+    stated = {sentence for sentence, _ in statements}
     return page_template("places.html").render(
         page=page,
+        further_doubts=[doubt for doubt in page.doubts if doubt not in stated],
         placement=page.placement,
         statements=statements,
         is_good=not (page.doubts or page.placement.skipped)
