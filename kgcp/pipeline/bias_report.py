@@ -177,7 +177,7 @@ class FlightBias:
     def _verdict(self, numbers: BiasNumbers, reexposed: Sequence[Reexposed] = ()) -> Verdict:
         consistency = self.consistency
         is_agreed = consistency is None or agrees(consistency)
-        return assess(numbers, reexposed, agrees=is_agreed, doubt_count=len(self.doubts))
+        return assess(numbers, reexposed, agrees=is_agreed, doubts=self.doubts)
 
     def _content(self, frames: Path | StoredFolder, reexpose: int) -> Content:
         numbers = bias_numbers(self.study)

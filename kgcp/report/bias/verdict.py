@@ -9,6 +9,7 @@ from enum import IntEnum
 from statistics import median
 
 from kgcp.quality.bias_causes import Term
+from kgcp.quality.checks.doubt import Doubt
 from kgcp.quality.number_text import counted, rounded
 from kgcp.report.bias.numbers import BIASED_SIGMAS, BiasNumbers, RangeRow
 from kgcp.report.bias.reexposure import GAINS, Reexposed
@@ -89,7 +90,7 @@ def assess(
     reexposed: Sequence[Reexposed] = (),
     *,
     agrees: bool = True,
-    doubt_count: int = 0,
+    doubts: Sequence[Doubt] = (),
 ) -> Verdict:
     """Judge a flight.
 
@@ -99,15 +100,16 @@ def assess(
         Distances of frames that were measured again.
     agrees : bool
         Whether vehicle and camera put the target at the same place.
-    doubt_count : int
-        Number of doubts about the flight's inputs.
+    doubts : sequence of Doubt
+        About the flight's inputs.
     """
+    is_grave = any(doubt.is_grave for doubt in doubts)
     findings = [
         _accuracy(numbers),
         _bias(numbers),
-        *_contradictions(agrees=agrees, doubt_count=doubt_count),
-        *_causes(numbers),
-        *_scatter(numbers),
+        *_contradictions(doubts, agrees=agrees),
+        # of wrong inputs they would only name consequences, with remedies that make it worse
+        *([] if is_grave else [*_causes(numbers), *_scatter(numbers), *_attitudes(numbers)]),
         *_exclusions(numbers),
         *_reexposure(reexposed),
         *_detection(numbers),
@@ -153,16 +155,22 @@ def _bias(numbers: BiasNumbers) -> Finding:
     return Finding(FlightGrade.LOOK if material else FlightGrade.GOOD, text, "error")
 
 
-def _contradictions(*, agrees: bool, doubt_count: int) -> Iterator[Finding]:
+def _contradictions(doubts: Sequence[Doubt], *, agrees: bool) -> Iterator[Finding]:
     """Yield a finding if inputs contradict each other; distances may hardly show it."""
-    if not agrees:
+    if any(doubt.is_grave for doubt in doubts):
+        text = (
+            "The inputs raise a grave doubt: correct them first. The errors include its effect; the"
+            " report names no other causes."
+        )
+        yield Finding(FlightGrade.LOOK, text, "consistency")
+    elif not agrees:
         text = (
             "Vehicle and camera do not put the target at the same place: the points of 'kgcp"
             " export-gcp' may be wrong, even if the distances are right."
         )
         yield Finding(FlightGrade.LOOK, text, "consistency")
-    elif doubt_count:
-        text = f"The inputs raise {counted(doubt_count, 'doubt')}."
+    elif doubts:
+        text = f"The inputs raise {counted(len(doubts), 'doubt')}."
         yield Finding(FlightGrade.LOOK, text, "consistency")
 
 
@@ -316,6 +324,9 @@ def _reservations(numbers: BiasNumbers) -> Iterator[Finding]:
         if stated_m:
             text += f", measured ones to {rounded(1000.0 * median(stated_m))} mm"
         yield Finding(FlightGrade.GOOD, f"{text} (median standard deviations).", "error")
+
+
+def _attitudes(numbers: BiasNumbers) -> Iterator[Finding]:
     if not numbers.attitudes_agree:
         yield Finding(
             FlightGrade.LOOK,

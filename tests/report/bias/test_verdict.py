@@ -9,6 +9,7 @@ import pytest
 from kgcp.geometry.arrays import FloatArray
 from kgcp.quality.bias_causes import Term
 from kgcp.quality.bias_study import BiasStudy, Comparison, ReferenceSds
+from kgcp.quality.checks.doubt import Cause, grave, mild
 from kgcp.report.bias.numbers import BiasNumbers, bias_numbers
 from kgcp.report.bias.reexposure import Reexposed
 from kgcp.report.bias.verdict import FlightGrade, assess
@@ -96,9 +97,20 @@ def test_a_flight_whose_points_are_wrong_is_not_good(fly: Fly) -> None:
     verdict = assess(fly(), agrees=False)
     assert verdict.grade is FlightGrade.LOOK
     assert "Vehicle and camera do not put the target at the same place" in verdict.sentences[1]
-    verdict = assess(fly(), doubt_count=2)
+    slight = mild(Cause.CLOCK, "late", "wait")
+    verdict = assess(fly(), doubts=[slight, slight])
     assert verdict.grade is FlightGrade.LOOK
     assert verdict.sentences[1] == "The inputs raise 2 doubts."
+
+
+def test_a_grave_doubt_is_not_followed_by_other_causes(fly: Fly) -> None:
+    """Times that are off by a second looked like a lever arm of another length."""
+    numbers = fly(lambda d: np.full_like(d, -0.08))
+    assert "check lever arm" in " ".join(assess(numbers).sentences)
+    wrong_times = grave(Cause.CLOCK, "frames and trajectory differ in time", "correct the times")
+    verdict = assess(numbers, doubts=[wrong_times], agrees=False)
+    assert "lever arm" not in " ".join(verdict.sentences)
+    assert "The inputs raise a grave doubt: correct them first." in " ".join(verdict.sentences)
 
 
 def test_focal_length_and_lever_arm_are_named(fly: Fly) -> None:
