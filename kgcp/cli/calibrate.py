@@ -182,18 +182,18 @@ def command(
         calibrated_photos(found, field, out, options, log) as made,
     ):
         results = write_results(made, out, formats, other)
+    summary = {
+        **results.summary,
+        "files": [str(path) for path in results.files],
+        "left_out": results.left_out,
+        "not_renewed": results.not_renewed,
+    }
     if as_json:
         import json
 
-        files = [str(path) for path in results.files]
-        file_notes = {
-            "files": files,
-            "left_out": results.left_out,
-            "not_renewed": results.not_renewed,
-        }
-        click.echo(json.dumps({**results.summary, **file_notes}))
+        click.echo(json.dumps(summary))
     if log_json and not is_quiet:
-        log.event("summary", **results.summary)
+        log.event("summary", **summary)
     elif not is_quiet:
         _report(results)
     if results.verdict.grade is CalibrationGrade.UNUSABLE:

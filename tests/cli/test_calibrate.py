@@ -229,6 +229,13 @@ def test_cameras_of_an_earlier_run_are_named(photos: Path, tmp_path: Path) -> No
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["not_renewed"] == ["opencv"]
     assert "not updated, from an earlier calibration: opencv" in result.stderr
+    machines = ("--json", "--log-json")
+    result = run(photos, "--field", photos / "field.toml", "--out", tmp_path, *options, *machines)
+    logged = json.loads(result.stderr.splitlines()[-1])
+    assert logged["event"] == "summary"
+    told = json.loads(result.stdout)
+    assert {key: logged[key] for key in told} == told
+    assert str(tmp_path / "camera.toml") in logged["files"]
 
 
 @pytest.mark.usefixtures("_no_figures")
