@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
+from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import FloatArray
@@ -327,6 +328,17 @@ def drone_pictures(**changes: object) -> tuple[Mapping[str, Any], ...]:
         | changes
         for height in heights
     )
+
+
+def with_receiver(one: Flight) -> Flight:
+    """Return a flight whose frames have the places of its reference poses in their headers."""
+    assert one.reference is not None
+    to_wgs84 = Transformer.from_crs(one.crs, "EPSG:4979", always_xy=True)
+    x, y, z = one.reference[:, :3].T
+    places = np.column_stack(to_wgs84.transform(x, y, z))[:, :2].tolist()
+    pictures = one.pictures or drone_pictures()
+    located = ({**each, "lonlat": place} for each, place in zip(pictures, places, strict=True))
+    return replace(one, pictures=tuple(located))
 
 
 def _heights_m() -> FloatArray:

@@ -19,6 +19,7 @@ from tests.wrong_flights.flights import (
     drone_pictures,
     flight,
     scaled,
+    with_receiver,
     without_reference,
 )
 
@@ -310,6 +311,12 @@ WITHOUT_REFERENCE: Mapping[str, Slip] = {
     ),
     "latitude in x, by the course": _slip(
         lambda _: without_reference(_swap_both(wgs84())), Cause.HEADING, Cause.AXES_SWAPPED
+    ),
+    "frames 5 s late, by the drone's GPS": _slip(
+        lambda one: replace(
+            one, pictures=with_receiver(flight()).pictures, frame_s=one.frame_s + 5
+        ),
+        Cause.CLOCK,
     ),
     "times of the next frame, by EXIF": _slip(_shift_times, Cause.CLOCK, Cause.FRAME_ORDER),
 }

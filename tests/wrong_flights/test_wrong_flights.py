@@ -14,7 +14,13 @@ from kgcp.io.flight.flight import read_flight
 from kgcp.pipeline.check import check_flight
 from kgcp.pipeline.export import make_gcps
 from kgcp.quality.checks.doubt import Cause, Doubt
-from tests.wrong_flights.flights import Flight, drone_pictures, flight, without_reference
+from tests.wrong_flights.flights import (
+    Flight,
+    drone_pictures,
+    flight,
+    with_receiver,
+    without_reference,
+)
 from tests.wrong_flights.slips import ANYWAY, PAIRS, WITH_REFERENCE, WITHOUT_REFERENCE, Slip
 
 SHARED = Path(__file__).resolve().parents[2] / ".." / "shared" / "flights"
@@ -126,7 +132,7 @@ CORRECT: dict[str, Callable[[], Flight]] = {
 @pytest.mark.parametrize("has_reference", [True, False])
 def test_correct_flights_raise_no_doubt(place: str, tmp_path: Path, *, has_reference: bool) -> None:
     one = CORRECT[place]()
-    one = one if has_reference else without_reference(one)
+    one = one if has_reference else without_reference(with_receiver(one))
     assert verdict(one, tmp_path / "flight") == Verdict(())
 
 

@@ -11,7 +11,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPositions
 from kgcp.quality.advice import corrections, is_explained
-from kgcp.quality.checks.camera_position import check_altitude
+from kgcp.quality.checks.camera_position import check_altitude, check_camera_beside_vehicle
 from kgcp.quality.checks.causes import MISFIT, causes_of
 from kgcp.quality.checks.doubt import Cause, Doubt, mild, ranked
 from kgcp.quality.checks.encounters import Encounters
@@ -69,9 +69,13 @@ def measured_doubts(
     of_print = [*check_print(sightings, targets, camera)]
     doubts = [*plausibility, *of_print, *_of_altitude(sightings, headers), *of_static]
     # If an input is certainly wrong, everything that follows from it disagrees.
-    if poses is not None and not any(doubt.is_grave for doubt in plausibility):
-        encounters = Encounters.of(sightings, target_positions, poses, camera)
-        if encounters is not None:
+    if not any(doubt.is_grave for doubt in plausibility):
+        encounters = None
+        if poses is not None:
+            encounters = Encounters.of(sightings, target_positions, poses, camera)
+        if encounters is None:
+            doubts += check_camera_beside_vehicle(sightings, headers, target_positions)
+        else:
             share = max((abs(doubt.figures["inner_growth"]) for doubt in of_print), default=0.0)
             doubts += _of_encounters(encounters, consistency, _DISTANCE_BY_GROWTH * share)
     return ranked(doubts)
