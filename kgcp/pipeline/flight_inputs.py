@@ -30,6 +30,7 @@ from kgcp.quality.checks.calibration import check_camera
 from kgcp.quality.checks.camera_position import check_camera_position
 from kgcp.quality.checks.clock import (
     check_completeness,
+    check_exif_deviation,
     check_exif_times,
     check_fractions,
     check_overlap,
@@ -308,11 +309,14 @@ class FlightInputs:
     def _doubts_of_times(self) -> Iterator[Doubt]:
         times = self.times_s
         if self.trajectory is not None and self.flight.vehicle is not None:
-            offset_s = self.flight.vehicle.settings.time_offset_s
+            settings = self.flight.vehicle.settings
             frame_s = np.array([times[frame] for frame in sorted(times)])
-            yield from check_overlap(frame_s, self.trajectory.time_s, offset_s)
-            yield from check_fractions(frame_s)
+            yield from check_overlap(frame_s, self.trajectory.time_s, settings.time_offset_s)
+            yield from check_fractions(frame_s, settings.sd_time_s)
             yield from check_same_times(times)
+            is_of_exif = any(header.time_s is not None for header in self.headers)
+            if is_of_exif and self.flight.times_file is None:
+                yield from check_exif_deviation(settings.sd_time_s)
         is_known = self.detected_s is not None or self._file_times is not None
         if self.flight.vehicle is not None and is_known:
             may_be_by_header = self.detected_s is None and self.flight.may_use_exif_times

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 
@@ -23,6 +24,10 @@ _SAME_TIME_SHARE = 0.02  # of the interval between frames, below which times cou
 _MAX_OUTSIDE_SHARE = 0.1  # of the frames: some are taken before a logger starts
 _GRAVE_OUTSIDE_SHARE = 0.5
 _MIN_WHOLE_SECONDS = 5  # fewer times may be whole seconds by chance
+_COARSE_STEPS_S = (0.1, 0.01)  # of rounded times; milliseconds are good enough
+_MIN_ROUNDED = 8  # fewer times in milliseconds may be hundredths by chance
+_STEP_TOLERANCE = 1e-3  # of a step, by which times are off that are written in microseconds
+_LIVELY_M_S = 10.0  # speed of a vehicle, for messages
 _CHECK_DATES = (
     "check the date and GPS week of both files: [vehicle] date names the first day of a trajectory"
     " in seconds of the week"
@@ -130,13 +135,14 @@ def check_completeness(frames: Sequence[str], times_s: Mapping[str, float]) -> I
     yield doubt(Cause.NO_TIMES, sentence, remedy, figures)
 
 
-def check_fractions(frame_s: FloatArray) -> Iterator[Doubt]:
-    """Yield the doubt about frame times (n,) that are all whole seconds.
+def check_fractions(frame_s: FloatArray, sd_time_s: float) -> Iterator[Doubt]:
+    """Yield the doubt about frame times (n,) that are all whole seconds, or coarsely rounded.
 
-    Either the clock has no fractions, or they were lost: spreadsheets round numbers of ten digits
-    in narrow columns, and save them so.
+    Either the clock has no finer fractions, or they were lost: spreadsheets round numbers of ten
+    digits in narrow columns, and save them so. `sd_time_s` is that of flight.toml [s].
     """
     if len(frame_s) < _MIN_WHOLE_SECONDS or np.any(frame_s != np.rint(frame_s)):
+        yield from _check_rounding(np.unique(frame_s), sd_time_s)
         return
     yield mild(
         Cause.WHOLE_SECONDS,
@@ -144,6 +150,43 @@ def check_fractions(frame_s: FloatArray) -> Iterator[Doubt]:
         "give times to the millisecond; if a spreadsheet has rounded them, export the file again",
         {"frames": float(len(frame_s))},
     )
+
+
+def _check_rounding(times: FloatArray, sd_time_s: float) -> Iterator[Doubt]:
+    """Yield the doubt about ascending times (n,) in tenths or hundredths of a second.
+
+    A trigger may fire at such times exactly. Then all intervals are multiples of the shortest one,
+    even where frames are missing; those of rounded times vary by a step.
+    """
+    for step_s in _COARSE_STEPS_S:
+        sd_s = step_s / math.sqrt(12.0)
+        counts = np.rint(times / step_s)
+        if len(times) < _MIN_ROUNDED or np.any(abs(times / step_s - counts) > _STEP_TOLERANCE):
+            continue
+        intervals = np.diff(counts).astype(np.int64)
+        if sd_time_s < sd_s and np.any(intervals % intervals.min()):
+            yield mild(
+                Cause.COARSE_TIMES,
+                f"all {len(times)} frame times are rounded to {step_s:g} s, but [vehicle] sd_time_s"
+                f" is {sd_time_s:g} s: a vehicle moves"
+                f" {_LIVELY_M_S * step_s:g} m in {step_s:g} s at {_LIVELY_M_S:g} m/s",
+                "give times to the millisecond, or set [vehicle] sd_time_s to at least"
+                f" {sd_s:.1g}, twice that if they are cut off",
+                {"step_s": step_s, "sd_time_s": sd_time_s},
+            )
+        return
+
+
+def check_exif_deviation(sd_time_s: float) -> Iterator[Doubt]:
+    """Yield the doubt about times of EXIF that count as exact, by the sd_time_s of flight.toml."""
+    if sd_time_s == 0.0:
+        yield mild(
+            Cause.STANDARD_DEVIATIONS,
+            "the frames' times are of the camera's clock (EXIF), and [vehicle] sd_time_s is 0 or"
+            " missing: they count as exact, and standard deviations of points leave them out",
+            "give a times file, or state in sd_time_s how well the camera's clock was set",
+            {"sd_time_s": sd_time_s},
+        )
 
 
 def check_same_times(times_s: Mapping[str, float]) -> Iterator[Doubt]:

@@ -89,6 +89,7 @@ class Cause(StrEnum):
     NO_OVERLAP = "no_overlap", "the times of frames and trajectory do not overlap"
     NO_TIMES = "no_times", "frames have no time"
     WHOLE_SECONDS = "whole_seconds", "frame times are whole seconds: too coarse, or truncated"
+    COARSE_TIMES = "coarse_times", "frame times are rounded more coarsely than sd_time_s says"
     SAME_TIMES = (
         "same_times",
         "several frames have the same time: they are copies, or times are in whole seconds",

@@ -5,6 +5,7 @@ import pytest
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.quality.checks.clock import (
+    check_exif_deviation,
     check_exif_times,
     check_fractions,
     check_overlap,
@@ -26,11 +27,40 @@ def test_frames_within_the_trajectory_raise_no_doubt() -> None:
 
 def test_times_in_whole_seconds_are_reported() -> None:
     """As a spreadsheet leaves Unix seconds."""
-    assert not [*check_fractions(FRAMES_S)]
-    assert not [*check_fractions(np.floor(FRAMES_S[:4]))]
-    (doubt,) = check_fractions(np.floor(FRAMES_S))
+    assert not [*check_fractions(FRAMES_S, 0.0)]
+    assert not [*check_fractions(np.floor(FRAMES_S[:4]), 0.0)]
+    (doubt,) = check_fractions(np.floor(FRAMES_S), 0.1)
     assert (doubt.code, doubt.is_grave) == (Cause.WHOLE_SECONDS, False)
     assert "all 24 frame times are whole seconds" in doubt.sentence
+
+
+@pytest.mark.parametrize(("step_s", "sd_s"), [(0.1, 0.03), (0.01, 0.003)])
+def test_times_that_are_rounded_more_coarsely_than_stated_are_reported(
+    step_s: float, sd_s: float
+) -> None:
+    """As by cameras that write one or two digits of the fraction."""
+    exact = START_S + 5.0013 + 1.5371 * np.arange(24.0)
+    assert not [*check_fractions(exact, 0.0)]
+    for rounded in (np.rint(exact / step_s), np.floor(exact / step_s)):
+        times = np.round(1e6 * step_s * rounded) / 1e6
+        (doubt,) = check_fractions(times, 0.001)
+        assert (doubt.code, doubt.is_grave) == (Cause.COARSE_TIMES, False)
+        assert f"rounded to {step_s:g} s" in doubt.sentence
+        assert f"at least {sd_s:g}" in doubt.remedy
+        assert not [*check_fractions(times, sd_s)]
+
+
+@pytest.mark.parametrize("period_s", [0.04, 0.1, 0.5, 1.5])
+def test_times_of_a_trigger_are_not_rounded(period_s: float) -> None:
+    """A trigger on the receiver's clock, also where most frames are left out."""
+    ticks = np.array([0, 1, 2, 4, 5, 9, 11, 12, 40, 41, 46, 47])
+    assert not [*check_fractions(START_S + period_s * ticks, 0.0)]
+
+
+def test_times_of_exif_do_not_count_as_exact() -> None:
+    (doubt,) = check_exif_deviation(0.0)
+    assert (doubt.code, doubt.is_grave) == (Cause.STANDARD_DEVIATIONS, False)
+    assert not [*check_exif_deviation(0.05)]
 
 
 @pytest.mark.parametrize(
