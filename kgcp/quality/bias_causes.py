@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import fdtrc
@@ -24,6 +24,9 @@ _MIN_KNOWN_SHARE = 0.9  # of the frames in which a quantity must be known
 _MAX_INFLATION = 25.0
 _MAX_INFLATION_BY_DISTANCE = 1000.0
 _CURVATURE = "edge_curvature_px2"
+# Least squared correlation, after scale and offset, with which the effect of a quantity that is not
+# estimated looks like that of another one.
+_ALIKE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +42,9 @@ class Term:
     # of a value as large by chance (Student's t, two-sided), with Holm's correction for the number
     # of terms
     probability: float
+    # quantities that are not estimated and vary like that of the term, so that the effect may be
+    # theirs instead
+    alike: tuple[str, ...] = ()
 
     @property
     def is_significant(self) -> bool:
@@ -187,9 +193,14 @@ def _regression(
     design = np.column_stack([columns[name] for name in names])
     share, probability = _share_of_exposure(names, result)
     values = _plain_fit(data, design, used & ~outlier)
-    unit = (data.residual_m - design @ values) / np.sqrt(data.errors.total)
+    weight = 1.0 / np.sqrt(data.errors.total)
+    unit = (data.residual_m - design @ values) * weight
+    rows = {name: column[used] * weight[used] for name, column in columns.items()}
     return Regression(
-        terms=_terms(names, result),
+        terms=tuple(
+            replace(term, alike=_alike(term.name, rows, [names[index] for index in basic], tangled))
+            for term in _terms(names, result)
+        ),
         tangled=tangled,
         count=int(np.count_nonzero(used & ~outlier)),
         used=used,
@@ -199,6 +210,34 @@ def _regression(
         exposure_share=share,
         exposure_probability=probability,
         systematic_m=design[:, basic] @ values[basic],
+    )
+
+
+def _alike(
+    name: str, rows: Mapping[str, FloatArray], basic: Sequence[str], tangled: Sequence[str]
+) -> tuple[str, ...]:
+    """Return the quantities without a term whose effect looks like that of a term of exposure.
+
+    Parameters
+    ----------
+    rows : mapping
+        Weighted columns (m,) of all terms and quantities.
+    basic : sequence of str
+        Terms of the distance, which take up their share of every effect.
+    """
+    if name in basic:
+        return ()
+    basis = np.linalg.qr(np.column_stack([rows[other] for other in basic]))[0]
+
+    def beyond_basic(column: FloatArray) -> FloatArray:
+        return np.asarray(column - basis @ (basis.T @ column))
+
+    own = beyond_basic(rows[name])
+    others = {other: beyond_basic(rows[other]) for other in tangled}
+    return tuple(
+        other
+        for other, column in others.items()
+        if (own @ column) ** 2 > _ALIKE * (own @ own) * (column @ column)
     )
 
 

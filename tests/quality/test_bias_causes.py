@@ -11,6 +11,7 @@ from kgcp.quality.bias_causes import Regression, Term, regress
 from kgcp.quality.bias_study import BiasStudy, edge_distances
 from kgcp.quality.exposure_effects import QUANTITIES, DistanceResiduals, in_time
 from kgcp.quality.robust_gls import ErrorModel
+from kgcp.report.bias.wording import exposure_sentence, meaning_of
 from kgcp.settings import Method
 
 Fly = Callable[..., BiasStudy]
@@ -119,6 +120,22 @@ def test_lasting_errors_do_not_displace_the_systematic_part() -> None:
     assert scatter < 1.5
 
 
+def test_blur_that_grows_with_the_exposure_time_may_be_the_cause_in_its_place() -> None:
+    """Motion blurs longer exposures; here it alone displaces edges, in a narrow range of times."""
+    rng = np.random.default_rng(3)
+    distance = rng.uniform(20.0, 90.0, 60)
+    exposure_s = 0.002 * 2.0 ** rng.uniform(0.0, 1.0, 60)
+    blur = np.hypot(0.5, 260.0 * exposure_s)
+    residual = 0.2 * blur * distance**2 / 1300.0 + 0.005 * rng.standard_normal(60)
+    found = regress(plain(distance, residual, 0.005, exposure_time_s=exposure_s, blur_px=blur))
+    assert found is not None
+    (term,) = found.exposure_terms
+    assert (term.name, term.alike, term.is_significant) == ("exposure_time_s", ("blur_px",), True)
+    both = "exposure time [s] or edge spread σ [px], which vary alike in this flight"
+    assert f"on the exposure ({both})" in exposure_sentence(found)
+    assert f"Distances depend on {both}" in meaning_of(term)
+
+
 def test_blur_of_curved_edges_is_separated_from_scale_and_offset() -> None:
     rng = np.random.default_rng(9)
     distance = np.exp(rng.uniform(2.3, 4.6, 300))
@@ -146,6 +163,7 @@ def test_of_inseparable_quantities_the_later_one_is_left_out() -> None:
     assert time is not None
     assert time.is_significant
     assert time.value == pytest.approx(0.03, abs=3.0 * time.sd)  # px per doubling
+    assert time.alike == ("white",)
     assert term_of(found, "iso") is None
     assert found.exposure_share > 0.8
     assert found.exposure_probability is not None

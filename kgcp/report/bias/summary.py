@@ -103,6 +103,7 @@ def _regression(regression: Regression | None) -> Json | None:
                 "sd": term.sd,
                 "probability": term.probability,
                 "significant": term.is_significant,
+                "alike": list(term.alike),
                 "text": meaning_of(term),
             }
             for term in regression.terms

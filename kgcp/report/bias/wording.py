@@ -80,11 +80,18 @@ def meaning_of(term: Term) -> str:
         )
     if term.name == "edge_shift_px":
         share = signed_amount(term.value, term.sd, "px")
+        other = f" This may be the effect of {_causes_of(term)}." if term.alike else ""
         return (
             f"Displaced edges change the distances: {share} per pixel of δ (1: fully, as with one"
-            " edge; 0: not at all)."
+            f" edge; 0: not at all).{other}"
         )
-    return f"Distances depend on {LABELS[term.name]}: the outer edge moves by {value_of(term)}."
+    return f"Distances depend on {_causes_of(term)}: the outer edge moves by {value_of(term)}."
+
+
+def _causes_of(term: Term) -> str:
+    """Return the quantity of a term, with those that may be the cause in its place."""
+    names = " or ".join(LABELS[name] for name in (term.name, *term.alike))
+    return f"{names}, which vary alike in this flight" if term.alike else names
 
 
 def _effect(term: Term) -> str:
@@ -108,8 +115,8 @@ def exposure_sentence(regression: Regression) -> str:
     share = f"{100.0 * regression.exposure_share:.0f} % of the variance after scale and offset"
     if not regression.is_exposure_significant:
         return f"No exposure term is significant; together, the terms explain {share}."
-    significant = [LABELS[term.name] for term in regression.exposure_terms if term.is_significant]
-    return f"The error depends on the exposure ({', '.join(significant)}), which explains {share}."
+    significant = [_causes_of(term) for term in regression.exposure_terms if term.is_significant]
+    return f"The error depends on the exposure ({'; '.join(significant)}), which explains {share}."
 
 
 def learnt_sentence(learnt: LearntImaging) -> str:
