@@ -22,7 +22,12 @@ from kgcp.io.images.remote import StoredFolder, frames_below
 from kgcp.io.tables.columns import Row
 from kgcp.io.tables.detections import DETECTION_COLUMNS, detection_rows
 from kgcp.io.tables.parquet import write_table
-from kgcp.io.tables.provenance import detections_provenance, versions, write_run_record
+from kgcp.io.tables.provenance import (
+    detections_provenance,
+    frame_samples,
+    versions,
+    write_run_record,
+)
 from kgcp.io.tables.staleness import refuse_to_replace_whole
 from kgcp.measurement.frame import examine
 from kgcp.measurement.guided import Prediction
@@ -442,6 +447,7 @@ def _write_detections(
         task.flight,
         task.settings,
         run.frame_sizes,
+        frame_samples(task.options.stored_frames or task.flight.frames_folder, run.frame_sizes),
         task.data.frame_times,
         run.learnt,
         task.options.frame_patterns,

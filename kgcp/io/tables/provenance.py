@@ -11,7 +11,7 @@ import hashlib
 import json
 import os
 import platform
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, astuple, fields
 from importlib.metadata import version
@@ -31,6 +31,7 @@ from kgcp.io.files.portable import peak_memory_mb
 from kgcp.io.files.safe_read import is_file
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.frame_times import FrameTimes
+from kgcp.io.images.remote import StoredFolder
 from kgcp.io.tables.columns import SCHEMA_VERSION
 from kgcp.io.tables.learnt_imaging import LEARNT_IMAGING, learnt_text
 from kgcp.measurement.records import TimeSource
@@ -45,12 +46,60 @@ TARGET_TABLE = "[[target]]"
 _SCALE_DIGITS = 12  # significant; the scale of a replica is computed from diameters
 _DIGITS = 32  # of a digest: 128 bits
 _PREFIX = b"kgcp."  # of the keys of Parquet's metadata
+_MAX_SAMPLED = 100  # frames whose contents are sampled
+_SAMPLE_BYTES, _SAMPLE_PLACES = 4096, 3  # of a file
+
+
+def frame_samples(
+    folder: Path | StoredFolder, frame_sizes: Mapping[str, int | None]
+) -> dict[str, str]:
+    """Return digests of frames by samples of their contents, at most 100 frames, evenly spaced.
+
+    Only of frames whose files are as long as others: uncompressed ones, which show by nothing else
+    that they are those of another flight. Files that cannot be read are left out.
+
+    Parameters
+    ----------
+    folder : Path or StoredFolder
+        Objects of a store are not read.
+    frame_sizes : mapping of str to int
+        Bytes of the file of every frame; None: missing.
+    """
+    if not isinstance(folder, Path):
+        return {}
+    counts = Counter(frame_sizes.values())
+    alike = [frame for frame, size in frame_sizes.items() if size and counts[size] > 1]
+    step = -(-len(alike) // _MAX_SAMPLED) or 1
+    samples = {
+        frame: content_sample(folder / frame, frame_sizes[frame] or 0) for frame in alike[::step]
+    }
+    return {frame: sample for frame, sample in samples.items() if sample is not None}
+
+
+def content_sample(path: Path, size: int) -> str | None:
+    """Return a digest of some bytes between head and end of a file; None: it cannot be read.
+
+    Parameters
+    ----------
+    size : int
+        Bytes of the file.
+    """
+    content = hashlib.sha256()
+    try:
+        with path.open("rb") as stream:
+            for place in range(1, _SAMPLE_PLACES + 1):
+                stream.seek(place * size // (_SAMPLE_PLACES + 1))
+                content.update(stream.read(_SAMPLE_BYTES))
+    except OSError:
+        return None
+    return content.hexdigest()[:_DIGITS]
 
 
 def detections_provenance(
     flight: Flight,
     settings: DetectSettings,
     frame_sizes: Mapping[str, int | None],
+    samples: Mapping[str, str],
     times: FrameTimes,
     learnt: LearntImaging | None,
     frame_patterns: Sequence[str] = (),
@@ -62,6 +111,8 @@ def detections_provenance(
     ----------
     frame_sizes : mapping of str to int
         Bytes of the file of every frame, in the order of the table; None: missing.
+    samples : mapping of str to str
+        As by `frame_samples`.
     times : FrameTimes
         Entries that belong to no frame are ignored.
     frame_patterns : sequence of str
@@ -87,6 +138,7 @@ def detections_provenance(
         "inputs": json.dumps(values),
         "frame_bytes": json.dumps([*frame_sizes.values()]),
         "digests": _digests(parts),
+        **({"frame_samples": json.dumps(samples)} if samples else {}),
         **({} if learnt is None else {LEARNT_IMAGING: learnt_text(learnt)}),
         **({"choice": json.dumps({"frames": frame_patterns})} if frame_patterns else {}),
     }

@@ -25,6 +25,7 @@ from kgcp.io.images.frames import is_chosen, list_frames
 from kgcp.io.images.remote import stamps_of
 from kgcp.io.tables.provenance import (
     TARGET_TABLE,
+    content_sample,
     detection_inputs,
     digest,
     digested_times,
@@ -308,6 +309,16 @@ def _changed_frames(
     stamps = zip(frames_now, stamps_of(flight.frames_folder, frames_now), strict=True)
     sizes_now = {frame: None if stamp is None else stamp[0] for frame, stamp in stamps}
     changed = [frame for frame, size in sizes_now.items() if sizes_then.get(frame, size) != size]
+    if not changed:  # uncompressed frames of another flight are as long
+        samples_then = _json(metadata, b"kgcp.frame_samples")
+        changed = [
+            frame
+            for frame, size in sizes_now.items()
+            if size
+            and frame in samples_then
+            and content_sample(flight.frames_folder / frame, size)
+            not in {samples_then[frame], None}
+        ]
     if changed:
         more = ", …" if len(changed) > 1 else ""
         yield f"files of {counted(len(changed), 'frame')} ({changed[0]}{more})"
