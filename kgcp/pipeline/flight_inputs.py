@@ -29,6 +29,7 @@ from kgcp.io.images.remote import StoredFolder, at_hand
 from kgcp.quality.checks.calibration import check_camera
 from kgcp.quality.checks.camera_position import check_camera_position
 from kgcp.quality.checks.clock import (
+    MIN_EXIF_TIMES,
     check_completeness,
     check_exif_deviation,
     check_exif_times,
@@ -330,13 +331,18 @@ class FlightInputs:
         if self.flight.times_file is not None:
             # EXIF agrees with itself
             compared = self._named_s if self.detected_s is None else times
-            both = [
-                (compared[header.frame], header.time_s)
-                for header in self.headers
-                if header.time_s is not None and header.frame in compared
-            ]
-            if both:
-                yield from check_exif_times(*zip(*both, strict=True))
+            for is_zone_known in (True, False):
+                both = [
+                    (header.frame, compared[header.frame], exif_s)
+                    for header in self.headers
+                    if (exif_s := header.time_s if is_zone_known else header.clock_s) is not None
+                    and header.frame in compared
+                ]
+                if len(both) >= MIN_EXIF_TIMES:
+                    yield from check_exif_times(
+                        *zip(*both, strict=True), is_zone_known=is_zone_known
+                    )
+                    return
 
     def _read(self, read: Callable[[], _Input]) -> _Input | None:
         try:

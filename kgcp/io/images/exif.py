@@ -125,6 +125,7 @@ def read_frame_header(path: Path, frame: str) -> FrameHeader:
             focal_35_mm=_positive(tags.main.get(Base.FocalLengthIn35mmFilm)),
             focal_px=_focal_px(tags.main, size_px),
             time_s=_time_s(tags.main),
+            clock_s=_original_s(tags.main, "Z"),
             longitude_deg=longitude_deg if has_position else None,
             latitude_deg=latitude_deg if has_position else None,
             altitude_m=_altitude_m(tags.xmp),
@@ -182,13 +183,16 @@ def _positive(value: object) -> float | None:
 
 
 def _time_s(tags: Mapping[int, Any]) -> float | None:
-    day, _, clock = _text(tags, Base.DateTimeOriginal).partition(" ")
-    fraction = _text(tags, Base.SubsecTimeOriginal)
     offset = _text(tags, Base.OffsetTimeOriginal)
     if not offset and _text(tags, Base.DateTime) == _text(tags, Base.DateTimeOriginal):
         offset = _text(tags, Base.OffsetTime)
-    if not offset:
-        return None
+    return _original_s(tags, offset) if offset else None
+
+
+def _original_s(tags: Mapping[int, Any], offset: str) -> float | None:
+    """Return DateTimeOriginal, with its fraction, as Unix seconds if that is its offset."""
+    day, _, clock = _text(tags, Base.DateTimeOriginal).partition(" ")
+    fraction = _text(tags, Base.SubsecTimeOriginal)
     seconds = f"{clock}.{fraction}" if fraction else clock
     try:
         return parse_time(f"{day.replace(':', '-')}T{seconds}{offset}")

@@ -20,9 +20,14 @@ GPS_MINUS_UTC_S, TAI_MINUS_UTC_S = 18.0, 37.0
 _LEAP_TOLERANCE_S = 1.2  # of differences in seconds, because EXIF has whole seconds
 _HOUR_TOLERANCE_S = 60.0  # of differences in hours and more
 _MAX_SPREAD_S = 2.0  # of a steady difference, by the median
+_MAX_LONE_S = (
+    3.0  # of the same in a single frame; EXIF has whole seconds, or when the file is begun
+)
 _SAME_TIME_SHARE = 0.02  # of the interval between frames, below which times count as equal
 _MAX_OUTSIDE_SHARE = 0.1  # of the frames: some are taken before a logger starts
 _GRAVE_OUTSIDE_SHARE = 0.5
+MIN_EXIF_TIMES = 3
+"""Least number of frames whose times can be compared with those of their EXIF."""
 _MIN_WHOLE_SECONDS = 5  # fewer times may be whole seconds by chance
 _COARSE_STEPS_S = (0.1, 0.01)  # of rounded times; milliseconds are good enough
 _MIN_ROUNDED = 8  # fewer times in milliseconds may be hundredths by chance
@@ -211,13 +216,24 @@ def check_same_times(times_s: Mapping[str, float]) -> Iterator[Doubt]:
     )
 
 
-def check_exif_times(times_s: Sequence[float], exif_s: Sequence[float]) -> Iterator[Doubt]:
-    """Compare the times of frames with those in their EXIF, both Unix UTC [s], in pairs.
+def check_exif_times(
+    frames: Sequence[str],
+    times_s: Sequence[float],
+    exif_s: Sequence[float],
+    *,
+    is_zone_known: bool = True,
+) -> Iterator[Doubt]:
+    """Compare the times of frames with those in their EXIF, both Unix UTC [s].
 
     A camera's clock is often set by hand, and drifts. Only a steady difference of leap seconds,
-    hours or weeks points to an error.
+    hours or weeks points to an error, and differences that are not the same in all frames.
+
+    Parameters
+    ----------
+    is_zone_known : bool
+        Whether EXIF states the zone; if not, its times are those of a clock of any zone.
     """
-    if len(times_s) < 3:
+    if len(times_s) < MIN_EXIF_TIMES:
         return
     difference = np.asarray(times_s) - np.asarray(exif_s)
     middle = float(np.median(difference))
@@ -230,6 +246,9 @@ def check_exif_times(times_s: Sequence[float], exif_s: Sequence[float]) -> Itera
             "check that every line of the times file has the time of the frame it names",
             {"spread_s": spread},
         )
+        return
+    yield from _check_lone_times(frames, difference, middle)
+    if not is_zone_known:
         return
     interval = float(np.median(np.abs(np.diff(exif_s))))
     for step, word in ((1, "next"), (-1, "previous")):
@@ -258,6 +277,28 @@ def check_exif_times(times_s: Sequence[float], exif_s: Sequence[float]) -> Itera
         f" those of their EXIF: {words}",
         "check which clock is right; correct the times file, or set [vehicle] time_offset_s",
         {"difference_s": middle},
+    )
+
+
+def _check_lone_times(
+    frames: Sequence[str], difference_s: FloatArray, middle_s: float
+) -> Iterator[Doubt]:
+    """Yield the doubt about frames whose times differ from EXIF (n,) otherwise than those of most.
+
+    Numbers by which times are assigned repeat in every folder of some drones.
+    """
+    off_s = difference_s - middle_s
+    others = np.flatnonzero(np.abs(off_s) > _MAX_LONE_S)
+    if not len(others):
+        return
+    worst_s = float(np.abs(off_s).max())
+    yield mild(
+        Cause.FRAME_ORDER,
+        f"the times of {len(others)} of {len(frames)} frames, such as {frames[int(others[0])]}, are"
+        f" up to {_seconds(worst_s)} from those of their EXIF, if the other frames' are right",
+        "check that every line of the times file has the time of the frame it names, and that"
+        " frames have not been renamed",
+        {"frames": float(len(others)), "difference_s": worst_s},
     )
 
 

@@ -31,6 +31,8 @@ class FrameHeader:
     focal_35_mm: float | None = None  # of a small-format camera with the same angle of view
     focal_px: float | None = None  # from `focal_mm` and the resolution of the focal plane
     time_s: float | None = None  # Unix UTC, if the header states its time zone [s]
+    # what the camera's clock showed, counted as Unix seconds count UTC, whatever its zone [s]
+    clock_s: float | None = None
     # of the camera, WGS 84
     longitude_deg: float | None = None
     latitude_deg: float | None = None

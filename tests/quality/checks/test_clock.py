@@ -16,6 +16,7 @@ from kgcp.quality.checks.doubt import Cause
 START_S = 1_781_597_700.0
 TRAJECTORY_S: FloatArray = START_S + np.arange(0.0, 45.0, 0.05)
 FRAMES_S: FloatArray = START_S + 5.0 + 1.5 * np.arange(24.0)
+NAMES = [f"{number}.jpg" for number in range(24)]
 
 
 def test_frames_within_the_trajectory_raise_no_doubt() -> None:
@@ -109,18 +110,18 @@ def test_frames_of_another_drive_are_reported() -> None:
 )
 def test_a_clock_that_contradicts_exif_is_reported(ahead_s: float, words: str) -> None:
     exif = np.floor(FRAMES_S)
-    (doubt,) = check_exif_times([*(FRAMES_S + ahead_s)], [*exif])
+    (doubt,) = check_exif_times(NAMES, [*(FRAMES_S + ahead_s)], [*exif])
     assert (doubt.code, doubt.is_grave) == (Cause.CLOCK, False)
     assert words in doubt.sentence
 
 
 def test_a_constant_offset_of_the_camera_clock_raises_no_doubt() -> None:
     for ahead_s in (0.0, 0.4, 5.0, -61.0, 1000.0):
-        assert not [*check_exif_times([*(FRAMES_S + ahead_s)], [*FRAMES_S])]
+        assert not [*check_exif_times(NAMES, [*(FRAMES_S + ahead_s)], [*FRAMES_S])]
 
 
 def test_times_assigned_to_other_frames_are_reported() -> None:
-    (doubt,) = check_exif_times([*FRAMES_S[::-1]], [*FRAMES_S])
+    (doubt,) = check_exif_times(NAMES, [*FRAMES_S[::-1]], [*FRAMES_S])
     assert doubt.code is Cause.FRAME_ORDER
 
 
@@ -133,3 +134,17 @@ def test_frames_with_the_time_of_another_are_counted() -> None:
         "2 of 7 frames have the time of another frame; 3.jpg, for example, has that of 3 (1).jpg"
         in (doubt.sentence)
     )
+
+
+@pytest.mark.parametrize(("zone_s", "is_zone_known"), [(0.0, True), (7200.0, False)])
+@pytest.mark.parametrize("count", [1, 8])
+def test_frames_with_the_times_of_others_are_named(
+    zone_s: float, count: int, *, is_zone_known: bool
+) -> None:
+    """As of a second folder of a drone, whose numbers begin anew."""
+    exif = np.floor(FRAMES_S) + zone_s + 0.7
+    assert not [*check_exif_times(NAMES, [*FRAMES_S], [*exif], is_zone_known=is_zone_known)]
+    exif[12 : 12 + count] += 600.0
+    (doubt,) = check_exif_times(NAMES, [*FRAMES_S], [*exif], is_zone_known=is_zone_known)
+    assert (doubt.code, doubt.is_grave) == (Cause.FRAME_ORDER, False)
+    assert f"the times of {count} of 24 frames, such as 12.jpg, are up to 600" in doubt.sentence
