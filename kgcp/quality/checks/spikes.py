@@ -123,7 +123,7 @@ def check_spikes(motion: Motion) -> Iterator[Doubt]:
             Cause.TRAJECTORY_SPIKE,
             f"the trajectory's epochs alternate between two paths {rounded(apart_m)} m apart"
             " (median)",
-            _JOINED_REMEDY,
+            f"{_JOINED_REMEDY}; if its times have been rounded, export it again",
             {"jump_m": apart_m},
         )
         return

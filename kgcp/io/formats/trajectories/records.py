@@ -15,6 +15,8 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.io.files.csv_columns import CsvLayout
 from kgcp.io.files.gps_time import TimeSystem
 
+_MIN_ROUNDED, _ROUNDED_SHARE = 5, 0.2  # equal times, from which on they may have been rounded
+
 
 class Wander(StrEnum):
     """How the wander angle of an SBET record turns its heading into the true one."""
@@ -76,6 +78,16 @@ def check_times(path: Path, time_s: FloatArray, place: Callable[[int], str]) -> 
     not_later = np.flatnonzero(np.diff(time_s) <= 0.0)
     if not_later.size:
         row = int(not_later[0]) + 1
+        repeated = int(np.count_nonzero(np.diff(time_s) == 0.0))
+        if repeated == len(not_later) and repeated >= max(
+            _MIN_ROUNDED, _ROUNDED_SHARE * len(time_s)
+        ):
+            raise KgcpError(
+                f"{path}, {place(row)}: the time repeats that of {place(row - 1)}, as do"
+                f" {repeated} of {len(time_s)} times; if they have been rounded, as spreadsheets"
+                " do, export the file again with fractions of a second, or make a flight folder of"
+                " each vehicle if they are of several"
+            )
         problem = "repeats" if time_s[row] == time_s[row - 1] else "lies before"
         raise KgcpError(
             f"{path}, {place(row)}: the time {problem} that of {place(row - 1)}, by"

@@ -65,6 +65,10 @@ def test_standard_deviations_are_optional_by_group(tmp_path: Path) -> None:
         ((_HEADER, _ROWS[0], "2026-05-04T09:30:01Z,1,2,3,4,5,"), ("line 3", "heading_deg")),
         ((_HEADER, _ROWS[1], _ROWS[0]), ("line 3", "before", "line 2")),
         ((_HEADER, _ROWS[0], _ROWS[0]), ("line 3", "repeats", "line 2")),
+        (
+            (_HEADER, *(f"2026-05-04T09:30:0{i // 5}Z,{i},2,3,4,5,6" for i in range(10))),
+            ("line 3", "8 of 10 times", "rounded", "export the file again"),
+        ),
         ((_HEADER, _ROWS[0], "", "2026-05-04T09:31,1,2,3,4,5,6"), ("line 4", "time zone")),
         ((_HEADER, _ROWS[0], "2026-05-04T09:31Z,1,2,3"), ("line 3", "4 cells")),
         (("time,x,y,z", "0,1,2,3"), ("roll_deg", "heading_deg", "lacks")),
