@@ -174,11 +174,13 @@ def _times(contents: FolderContents, headers: Sequence[FrameHeader]) -> _Times:
         csv = csv_text(("frame", "time"), rows)
         return _Times(by_name, (key, InitFinding("times", text)), csv)
     time_s = {each.frame: each.time_s for each in headers if each.time_s is not None}
-    parts = _exif_time_parts(time_s, is_moving=bool(contents.trajectories))
+    parts = _exif_time_parts(time_s, len(contents.frames), is_moving=bool(contents.trajectories))
     return _Times(time_s, (*unreadable, *parts))
 
 
-def _exif_time_parts(time_s: Mapping[str, float], *, is_moving: bool) -> Iterator[Part]:
+def _exif_time_parts(
+    time_s: Mapping[str, float], frames: int, *, is_moving: bool
+) -> Iterator[Part]:
     remedy = "give the camera's Timestamp.MRK, or frames.csv with the columns frame and time"
     is_missing = is_moving and not time_s
     yield DraftKey(
@@ -186,12 +188,18 @@ def _exif_time_parts(time_s: Mapping[str, float], *, is_moving: bool) -> Iterato
     )
     why = "no file states the times of the frames, nor does EXIF together with a time zone"
     if time_s:
-        yield InitFinding("times", f"{_span(time_s)}, from EXIF ({len(time_s)} frames)")
+        which = f"{len(time_s)} of {frames}" if len(time_s) < frames else str(frames)
+        yield InitFinding("times", f"{_span(time_s)}, from EXIF ({which} frames)")
         why = "EXIF times are rarely good to a millisecond, in which a vehicle moves a centimetre"
+        if all(moment.is_integer() for moment in time_s.values()):
+            why = "EXIF times are in whole seconds, in which a vehicle moves metres"
+        if len(time_s) < frames:
+            lacking = frames - len(time_s)
+            why = f"EXIF has no time with a zone in {lacking} of {frames} frames; {why}"
     elif not is_moving:
         yield InitFinding("times", f"none: {why}; static targets need none")
     if is_moving:
-        yield Gap("times", why, remedy, is_assumed=bool(time_s))
+        yield Gap("times", why, remedy, is_assumed=len(time_s) == frames)
 
 
 def _span(time_s: Mapping[str, float]) -> str:

@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from PIL import Image
+from PIL.ExifTags import IFD, Base
 
 from benchmarks.first_flight.bare_folders import (
     LEVER_ARM,
@@ -464,3 +466,35 @@ def test_folders_are_quoted_where_shells_need_it(folder: str) -> None:
     assert quoted(Path(folder)) == f'"{folder}"'
     plain = str(Path("/flights/Höhe_7.1~a"))
     assert quoted(Path(plain)) == plain
+
+
+@pytest.mark.parametrize(
+    ("subsec", "zoned", "lines"),
+    [
+        ("25", 3, ("assumed: times", "rarely good to a millisecond", "from EXIF (3 frames)")),
+        ("", 3, ("assumed: times", "in whole seconds", "from EXIF (3 frames)")),
+        (
+            "25",
+            2,
+            ("missing: times", "no time with a zone in 1 of 3 frames", "from EXIF (2 of 3 frames)"),
+        ),
+    ],
+)
+def test_exif_times_that_are_coarse_or_missing_are_named(
+    tmp_path: Path, subsec: str, zoned: int, lines: tuple[str, ...]
+) -> None:
+    (tmp_path / "frames").mkdir()
+    for number in range(3):
+        exif = Image.Exif()
+        tags = exif.get_ifd(IFD.Exif)
+        tags[Base.DateTimeOriginal] = f"2026:05:04 11:30:0{number}"
+        tags[Base.SubsecTimeOriginal] = subsec
+        if number < zoned:
+            tags[Base.OffsetTimeOriginal] = "+02:00"
+        Image.new("L", (64, 48)).save(tmp_path / "frames" / f"{number}.jpg", exif=exif)
+    header = "time,x,y,z,roll_deg,pitch_deg,heading_deg"
+    rows = [f"2026-05-04T09:30:0{second}Z,689000,5336000,545,0,0,0" for second in range(5)]
+    (tmp_path / "vehicle.csv").write_text("\n".join([header, *rows]))
+    text = " ".join(init(tmp_path, "--crs", "EPSG:25832", *TARGET).stderr.split())
+    for line in lines:
+        assert line in text
