@@ -29,6 +29,7 @@ _MIN_SIGHTINGS = 5
 _RECEIVER_M, _NORMAL_SHARE = 10.0, 0.2
 _MIN_COVERED_SHARE = 0.6  # of the sightings, that must be within the trajectory after a shift
 _SCAN_S, _SCAN_STEP_S = 120.0, 0.5  # of shifts of the clock that are not usual ones
+_DAY_S = 86_400.0  # whole days are slips of dates, which no offset corrects
 _MAX_EPOCHS = 20_000  # of a trajectory that are transformed
 
 
@@ -129,13 +130,14 @@ def check_camera_beside_vehicle(
     apart_m, measured_m = beside.apart_m(0.0), float(np.median(beside.measured_m))
     count = len(beside.time_s)
     sentence = (
-        f"by the frames' GPS, the camera was {apart_m:.0f} m beside the vehicle (median of {count}"
-        f" frames), but by the measured poses {measured_m:.0f} m"
+        f"by the times of frames and trajectory, the frames' GPS puts the camera {apart_m:.0f} m"
+        f" beside the vehicle (median of {count} frames), but the measured poses put it"
+        f" {measured_m:.0f} m beside it"
     )
     figures = {"apart_m": apart_m, "measured_m": measured_m, "frames": float(count)}
     offset_s = beside.vehicle.settings.time_offset_s
     for shift_s, cause in clock_shifts_s():
-        if beside.fits(shift_s):
+        if shift_s % _DAY_S != 0.0 and beside.fits(shift_s):
             yield grave(
                 Cause.CLOCK,
                 f"{sentence}: {cause}",

@@ -87,4 +87,4 @@ def test_a_vehicle_elsewhere_is_a_doubt_about_the_place() -> None:
     (doubt,) = _doubts(ahead_s=0.0, north_m=300.0)
     assert (doubt.code, doubt.is_grave) == (Cause.CAMERA_POSITION, False)
     assert doubt.figures["apart_m"] == pytest.approx(312.0, abs=5.0)
-    assert "(median of 12 frames), but by the measured poses 12 m" in doubt.sentence
+    assert "(median of 12 frames), but the measured poses put it 12 m beside it" in doubt.sentence
