@@ -318,6 +318,9 @@ WITHOUT_REFERENCE: Mapping[str, Slip] = {
         ),
         Cause.CLOCK,
     ),
+    "times in tenths of a second": _slip(
+        lambda one: replace(one, frame_s=np.floor(10.0 * one.frame_s) / 10.0), Cause.COARSE_TIMES
+    ),
     "times of the next frame, by EXIF": _slip(_shift_times, Cause.CLOCK, Cause.FRAME_ORDER),
 }
 """What other things tell where there is no reference."""
