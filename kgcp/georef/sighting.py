@@ -40,7 +40,8 @@ class Sighting:
     # (6, 6): share of calibration and diameter, not included in `pose_cov`; None: not known
     common_pose_cov: FloatArray | None = None
     image: CircleImage | None = None  # of a plain target's outer circle, without any prior
-    inner_growth: float | None = None  # as `Appearance.inner_growth`
+    inner_growth: float | None = None  # as in `Appearance`
+    dots_growth: float | None = None
 
     @property
     def has_heading(self) -> bool:
@@ -94,6 +95,7 @@ def sighting_of(
         common_pose_cov=None if common is None else common.pose_cov,
         image=measurement.image,
         inner_growth=measurement.appearance.inner_growth,
+        dots_growth=measurement.appearance.dots_growth,
     )
 
 

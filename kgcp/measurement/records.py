@@ -34,6 +34,9 @@ class Appearance:
     inner_growth : float or None
         By how much the image shows the main ring's inner circle larger than the layout, relative
         to the outer one, as a share; None where the method does not estimate it.
+    dots_growth : float or None
+        The same for the code: the circle through the dots' centres, and the dots, relative to the
+        ring.
     """
 
     radius_px: float
@@ -43,6 +46,7 @@ class Appearance:
     edge_shift_px: float | None = None
     blur_px: float | None = None
     inner_growth: float | None = None
+    dots_growth: float | None = None
 
 
 class ToneBase(StrEnum):

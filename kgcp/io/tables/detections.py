@@ -178,6 +178,12 @@ DETECTION_COLUMNS: tuple[Column[_Record], ...] = (
         _measured(lambda measurement: measurement.appearance.inner_growth),
         is_later=True,
     ),
+    Column(
+        "dots_growth",
+        NUMBER,
+        _measured(lambda measurement: measurement.appearance.dots_growth),
+        is_later=True,
+    ),
     Column("black", NUMBER, _measured(lambda measurement: measurement.appearance.black)),
     Column("white", NUMBER, _measured(lambda measurement: measurement.appearance.white)),
     Column("saturated", NUMBER, _measured(lambda measurement: measurement.appearance.saturated)),
@@ -392,6 +398,7 @@ def _sighting(row: _Cells, number: int, time_s: float | None) -> Sighting:
         common_pose_cov=_matrix(row, "common_pose_cov", 6),
         image=_circle_image(row),
         inner_growth=_number(row, "inner_growth"),
+        dots_growth=_number(row, "dots_growth"),
     )
 
 

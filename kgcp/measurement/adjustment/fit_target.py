@@ -27,7 +27,12 @@ from kgcp.measurement.adjustment.extensions import (
 )
 from kgcp.measurement.adjustment.problem import FitProblem, apparent_tone
 from kgcp.measurement.adjustment.random_levels import even_field, fit_levels
-from kgcp.measurement.adjustment.smoothing import contour_smoothing, inner_growth, with_smoothing
+from kgcp.measurement.adjustment.smoothing import (
+    contour_smoothing,
+    dots_growth,
+    inner_growth,
+    with_smoothing,
+)
 from kgcp.measurement.adjustment.solver import TargetFit
 from kgcp.measurement.adjustment.two_poses import (
     TwoPoses,
@@ -267,7 +272,11 @@ def _measurement(
         pose=pose,
         centre_px=camera.project(pose.translation_m[None])[0],
         heading_deg=image_heading_deg(camera, pose),
-        appearance=replace(appearance_of(camera, target, best), inner_growth=inner_growth(best)),
+        appearance=replace(
+            appearance_of(camera, target, best),
+            inner_growth=inner_growth(best),
+            dots_growth=dots_growth(best),
+        ),
         imaging=imaging_of(best),
         alternative=Alternative(other.parameters.pose, ambiguity, other_cov),
         uncertainty=propagate(camera, pose, pose_cov),

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.measurement.adjustment.covariance import nearest_edges, propagate, unevenness_factor
@@ -61,9 +61,28 @@ def inner_growth(fit: TargetFit) -> float | None:
     comes nearer by a share of its distance grows by the same share. None where no pixel tells: if
     the circle is hidden, or so far from its place that its pixels are outliers.
     """
-    circle, _ = nearest_edges(fit)
+    return _growth(fit, nearest_edges(fit)[0] == 1)
+
+
+def dots_growth(fit: TargetFit) -> float | None:
+    """Return by how much the image shows the code larger than stated, as a share.
+
+    It is what the circle through the dots' centres, and the dots with it, have to grow, relative to
+    the ring, to fit best. None where no pixel tells.
+    """
+    return _growth(fit, nearest_edges(fit)[0] >= 2)
+
+
+def _growth(fit: TargetFit, is_at_edge: BoolArray) -> float | None:
+    """Return by how much edges have to move away from the target's centre, as a share.
+
+    Parameters
+    ----------
+    is_at_edge : (n,) array
+        Whether a pixel's nearest edge is one of those that move.
+    """
     approach = -(fit.parameters.pose.translation_m @ fit.jacobian[:3])
-    by_growth = np.where(circle == 1, approach, 0.0)
+    by_growth = np.where(is_at_edge, approach, 0.0)
     if not np.any(by_growth * fit.misfit.weight):
         return None
     growth = _added_unknown(fit, by_growth)[0]

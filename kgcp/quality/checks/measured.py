@@ -31,7 +31,7 @@ from kgcp.targets.plain import AnyTarget
 # Ratio of a disagreement to what the print explains, from which on it has another cause, too.
 _MIN_UNEXPLAINED_RATIO = 3.0
 # Error of the distance by that of the ratio of diameters: 0.13 if the inner diameter alone is
-# wrong, 0.39 if the outer one alone is right.
+# wrong, 0.2 if the dots alone are, 0.39 if the outer diameter alone is right.
 _DISTANCE_BY_GROWTH = 0.4
 
 
@@ -76,7 +76,7 @@ def measured_doubts(
         if encounters is None:
             doubts += check_camera_beside_vehicle(sightings, headers, target_positions)
         else:
-            share = max((abs(doubt.figures["inner_growth"]) for doubt in of_print), default=0.0)
+            share = max((abs(doubt.figures["growth"]) for doubt in of_print), default=0.0)
             doubts += _of_encounters(encounters, consistency, _DISTANCE_BY_GROWTH * share)
     return ranked(doubts)
 

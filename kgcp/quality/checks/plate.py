@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,8 +29,8 @@ _USUAL_DIAMETERS_M = 0.15, 3.0
 _INNER_RATIOS = 0.4, 0.7
 _MAX_DOT_SHARE = 0.33  # of the ring's area
 _MIN_FRAMES = 6
-# A print is in doubt if its inner circle is larger or smaller than stated by this share and by so
-# many standard deviations. A share of 0.2 % makes distances wrong by 0.03 to 0.08 %.
+# A print is in doubt if its inner circle or its code is larger or smaller than stated by this share
+# and by so many standard deviations. A share of 0.2 % makes distances wrong by 0.03 to 0.08 %.
 _MIN_GROWTH, _MIN_RATIO = 2e-3, 5.0
 # What may displace the inner edge in all frames alike, as an error of the tone curve does [px]
 _SD_EDGE_PX = 0.03
@@ -85,37 +86,90 @@ def _check_layout(ring: Ring) -> Iterator[Doubt]:
 def check_print(
     sightings: Sequence[Sighting], targets: Sequence[AnyTarget], camera: Camera
 ) -> Iterator[Doubt]:
-    """Yield the doubt about printed diameters whose ratio is not the stated one."""
+    """Yield the doubt about a printed inner circle or code that is not as stated for its ring.
+
+    If one of them is wrong, the other seems to be, too, by a quarter of its growth or less and with
+    the other sign. If the outer diameter is wrong, both grow alike, and the inner one is named.
+    """
     for target in targets:
         if not isinstance(target, Target):
             continue
+        of_target = [each for each in sightings if each.target == target.name]
         ring = target.ring
-        seen = np.array(
-            [
-                (each.distance_m, each.inner_growth)
-                for each in sightings
-                if each.target == target.name and each.inner_growth is not None
-            ]
+        inner = _seen_growth(
+            [(each.distance_m, each.inner_growth) for each in of_target],
+            0.5 * ring.inner_diameter_m * camera.mean_focal_px,
         )
-        if len(seen) < _MIN_FRAMES:
-            continue
-        growth, sd = _common_growth(
-            seen[:, 1], 0.5 * ring.inner_diameter_m * camera.mean_focal_px / seen[:, 0]
+        dots = _seen_growth(
+            [(each.distance_m, each.dots_growth) for each in of_target],
+            0.5 * ring.code_diameter_m * camera.mean_focal_px,
         )
-        if abs(growth) < max(_MIN_GROWTH, _MIN_RATIO * sd):
-            continue
-        yield mild(
-            Cause.DIAMETERS,
-            f"in {len(seen)} frames, the inner circle of {target.name!r} is"
-            f" {amount(100.0 * abs(growth), 100.0 * sd)} % too {'large' if growth > 0 else 'small'}"
-            " for the outer one: diameters are not those of the print, and all distances are wrong"
-            " by the same factor",
-            "measure both diameters of the ring and give all lengths of [[target]] as printed"
-            f" (for outer_diameter_m = {ring.outer_diameter_m:g}, an inner_diameter_m of about"
-            f" {ring.inner_diameter_m * (1.0 + growth):.4g} would fit); a print at another scale"
-            " changes all of them; if they are right, check response in [camera]",
-            {"inner_growth": growth, "sd_inner_growth": sd},
-        )
+        if dots is not None and (inner is None or abs(dots.share) > 2.0 * abs(inner.share)):
+            yield _doubt_about_dots(ring, dots)
+        elif inner is not None:
+            yield _doubt_about_inner_circle(ring, inner)
+
+
+def _doubt_about_inner_circle(ring: Ring, growth: _Growth) -> Doubt:
+    return mild(
+        Cause.DIAMETERS,
+        f"in {growth.frames} frames, the inner circle of {ring.name!r} is"
+        f" {growth.amount} % too {'large' if growth.share > 0 else 'small'}"
+        " for the outer one: diameters are not those of the print, and all distances are wrong"
+        " by the same factor",
+        "measure both diameters of the ring and give all lengths of [[target]] as printed"
+        f" (for outer_diameter_m = {ring.outer_diameter_m:g}, an inner_diameter_m of about"
+        f" {ring.inner_diameter_m * (1.0 + growth.share):.4g} would fit); a print at another scale"
+        " changes all of them; if they are right, check response in [camera]",
+        {"growth": growth.share, "sd_growth": growth.sd},
+    )
+
+
+def _doubt_about_dots(ring: Ring, growth: _Growth) -> Doubt:
+    place, size = ("out", "large") if growth.share > 0 else ("in", "small")
+    return mild(
+        Cause.DIAMETERS,
+        f"in {growth.frames} frames, the dots of {ring.name!r} are {growth.amount} % too far"
+        f" {place} or too {size} for its ring: they are not those of the print, and all distances"
+        " are wrong by the same factor",
+        "measure the dots and the circle through their centres, and give dot_diameter_m and"
+        " code_diameter_m as printed (if the dots have the stated size, a code_diameter_m of about"
+        f" {ring.code_diameter_m * (1.0 + growth.share):.4g} would fit)",
+        {"growth": growth.share, "sd_growth": growth.sd},
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Growth:
+    """What the frames have in common: growth of a circle, and its standard deviation."""
+
+    share: float
+    sd: float
+    frames: int
+
+    @property
+    def amount(self) -> str:
+        """The absolute growth in percent, with the digits that are certain."""
+        return amount(100.0 * abs(self.share), 100.0 * self.sd)
+
+
+def _seen_growth(seen: Sequence[tuple[float, float | None]], radius_m_px: float) -> _Growth | None:
+    """Return the growth that makes a print doubtful; None if it is not significant.
+
+    Parameters
+    ----------
+    seen : sequence of (float, float or None)
+        Distance [m] and growth in each sighting.
+    radius_m_px : float
+        Radius of the circle times the focal length [m px].
+    """
+    known = np.array([(distance_m, growth) for distance_m, growth in seen if growth is not None])
+    if len(known) < _MIN_FRAMES:
+        return None
+    share, sd = _common_growth(known[:, 1], radius_m_px / known[:, 0])
+    if abs(share) < max(_MIN_GROWTH, _MIN_RATIO * sd):
+        return None
+    return _Growth(share, sd, len(known))
 
 
 def _common_growth(growth: FloatArray, radius_px: FloatArray) -> tuple[float, float]:

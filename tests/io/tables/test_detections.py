@@ -40,7 +40,11 @@ FULL = Measurement(
     centre_px=np.array([700.25, 401.5]),
     heading_deg=38.5,
     appearance=Appearance(
-        41.0, 0.06, 0.81, 0.02, edge_shift_px=0.11, blur_px=0.8, inner_growth=0.0012
+        *(41.0, 0.06, 0.81, 0.02),
+        edge_shift_px=0.11,
+        blur_px=0.8,
+        inner_growth=0.0012,
+        dots_growth=-0.0007,
     ),
     alternative=Alternative(POSE.mirrored(), 17.5),
     uncertainty=Uncertainty(COV, np.array([[4e-4, 1e-5], [1e-5, 9e-4]]), 0.03, 0.2, 0.3, 0.1),

@@ -121,15 +121,23 @@ def test_smoothing_of_single_frames_is_as_good_as_stated() -> None:
 
 
 @pytest.mark.parametrize("growth", [-0.01, 0.0, 0.01])
-def test_an_inner_circle_of_another_size_shows(
-    photograph: Callable[..., GreyArray], start_near: Callable[..., InitialPose], growth: float
+@pytest.mark.parametrize(
+    ("diameter", "seen"),
+    [("inner_diameter_m", "inner_growth"), ("code_diameter_m", "dots_growth")],
+)
+def test_a_circle_of_another_size_shows(
+    photograph: Callable[..., GreyArray],
+    start_near: Callable[..., InitialPose],
+    diameter: str,
+    seen: str,
+    growth: float,
 ) -> None:
     ring = TARGET_PLATE.target.ring
-    printed = replace(ring, inner_diameter_m=ring.inner_diameter_m * (1.0 + growth))
+    printed = replace(ring, **{diameter: getattr(ring, diameter) * (1.0 + growth)})
     plate = replace(TARGET_PLATE, target=replace(TARGET_PLATE.target, ring=printed))
     camera = replace(CAMERA, response=Response.LINEAR)
     rng, pose = np.random.default_rng(3), pose_of(1)
     grey = photograph(camera, pose, rng, plate=plate)
     start = start_near(camera, pose, rng)
     measured = measure_by_model(grey, camera, TARGET_PLATE.target, start)
-    assert measured.appearance.inner_growth == pytest.approx(growth, abs=0.0015)
+    assert getattr(measured.appearance, seen) == pytest.approx(growth, abs=0.0015)

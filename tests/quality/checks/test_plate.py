@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -62,10 +63,11 @@ def test_diameters_in_other_units_are_reported(outer_m: float, words: str) -> No
 CAMERA = Camera(1200, 900, 1900.0, 1900.0, 600.0, 450.0)
 
 
-def sighting(distance_m: float, growth: float) -> Sighting:
+def sighting(distance_m: float, growth: float, of_dots: float | None = None) -> Sighting:
     frame = f"{distance_m:.3f}.png"
     at = np.array([600.0, 450.0])
-    return Sighting(frame, 1, "A", 0, None, at, None, distance_m, None, None, inner_growth=growth)
+    seen = Sighting(frame, 1, "A", 0, None, at, None, distance_m, None, None)
+    return replace(seen, inner_growth=growth, dots_growth=of_dots)
 
 
 @pytest.mark.parametrize(
@@ -94,4 +96,27 @@ def test_an_inner_circle_that_is_not_as_stated_in_all_frames_is_reported(
     for doubt in doubts:
         assert words in doubt.sentence
         assert not doubt.is_grave
-        assert doubt.figures["inner_growth"] == pytest.approx(growth, abs=0.001)
+        assert doubt.figures["growth"] == pytest.approx(growth, abs=0.001)
+
+
+@pytest.mark.parametrize(
+    ("inner", "dots", "words"),
+    [
+        (0.0, 0.001, ""),  # negligible
+        (0.0, 0.01, "% too far out or too large for its ring"),
+        (0.002, -0.01, "% too far in or too small for its ring"),
+        (0.034, -0.0065, "the inner circle of 'A' is 3.4"),  # as if the dots were displaced, too
+        (-0.0071, -0.0073, "the inner circle of 'A' is 0.7"),  # the outer diameter is wrong
+    ],
+)
+def test_dots_that_are_not_as_stated_are_told_from_a_wrong_inner_circle(
+    inner: float, dots: float, words: str
+) -> None:
+    rng = np.random.default_rng(7)
+    distances_m = np.geomspace(9.0, 50.0, 24)
+    noise = 0.02 * (0.3 * CAMERA.mean_focal_px / distances_m) ** -1.5
+    seen = np.array([[inner], [dots]]) + noise * rng.standard_normal((2, 24))
+    sightings = [*map(sighting, distances_m.tolist(), seen[0].tolist(), seen[1].tolist())]
+    doubts = [*check_print(sightings, [target()], CAMERA)]
+    assert [doubt.code for doubt in doubts] == [Cause.DIAMETERS] * bool(words)
+    assert all(words in doubt.sentence for doubt in doubts)
