@@ -407,7 +407,10 @@ def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
         yield f"These photographs do not determine {names}: come closer, and tilt more."
     yield from _field_advice(calibration, numbers)
     if numbers.light is not None and numbers.light.doubt:
-        yield "Give photographs as the camera took them, not negatives, and without burnt white."
+        yield (
+            "Give photographs as the camera took them, not negatives, and without burnt white; use"
+            " a matt print without a cover, and turn it away from lamps and windows."
+        )
 
 
 def _handling_advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iterator[str]:

@@ -1,9 +1,10 @@
-"""Test for negatives and burnt white: light must change bright levels more than dark ones.
+"""Test for negatives, reflections and burnt white: light must change bright levels most.
 
 Light multiplies what a surface reflects. Where it falls off over a photograph, bright levels
 therefore change the most. In a negative, the dark ones do; with burnt white, the bright ones do not
 change. The falloff over bright surfaces is then unknown, and is mistaken for a displacement of
-edges by a few hundredths of a pixel, all in one direction.
+edges by a few hundredths of a pixel, all in one direction. Reflections on a glossy sheet add the
+same light to dark and bright; a tone curve that is steeper in the dark then shows it there most.
 """
 
 from __future__ import annotations
@@ -41,10 +42,11 @@ class DiscLight:
         if self.dark < _MIN_CHANGE or self.bright >= _MIN_RATIO * self.dark:
             return ""
         is_unclipped = self.clipped <= _BURNT
-        cause = "they look like" if is_unclipped else "white is burnt, or they are"
+        cause = "" if is_unclipped else "white is burnt, or "
         return (
             f"the light changes dark levels of the photographs by {100.0 * self.dark:.1f} % and"
-            f" bright ones by {100.0 * self.bright:.1f} % only: {cause} negatives"
+            f" bright ones by {100.0 * self.bright:.1f} % only: {cause}they are negatives, or the"
+            " field reflects light"
         )
 
 

@@ -686,8 +686,8 @@ def test_negatives_are_reported_for_checking() -> None:
     result = calibrated(views(), lens=LensModel.AUTO)
     verdict = judge(result, calibration_numbers(result, DiscLight(0.07, 0.01, 0.0)))
     assert verdict.grade is CalibrationGrade.LOOK
-    assert "they look like negatives" in verdict.sentence
-    assert any("not negatives" in text for text in verdict.advice)
+    assert "they are negatives" in verdict.sentence
+    assert any("not negatives" in text and "matt" in text for text in verdict.advice)
 
 
 def in_burst(made: list[NamedView]) -> list[NamedView]:

@@ -41,18 +41,25 @@ def test_uniform_reflections_raise_no_doubt() -> None:
     assert of_levels(0.05 + glare, 0.6 + glare).doubt == ""
 
 
+def test_reflections_that_a_tone_curve_shows_in_the_dark_are_named() -> None:
+    """They pass for negatives: the slope of sRGB's curve is larger there."""
+    glare = 0.1 * light(1.0)
+    found = of_levels((0.04 + glare) ** (1.0 / 2.4), (0.6 + glare) ** (1.0 / 2.4))
+    assert found.doubt.endswith("or the field reflects light")
+
+
 @pytest.mark.parametrize("is_bright", [False, True])
 def test_negatives_are_recognised_with_any_discs(*, is_bright: bool) -> None:
     levels = (1.0 - 0.1 * light(0.6), 1.0 - 0.8 * light(0.6))
     found = of_levels(*(levels if is_bright else levels[::-1]))
-    assert "they look like negatives" in found.doubt
+    assert "only: they are negatives" in found.doubt
     assert 0.1 < found.bright / found.dark < 0.15
 
 
 @pytest.mark.parametrize("clipped", [0.3, np.nan])
 def test_burnt_white_may_be_the_cause(clipped: float) -> None:
     found = of_levels(0.4 * light(0.6), np.ones(len(PLACES_PX)), clipped)
-    assert "white is burnt, or they are negatives" in found.doubt
+    assert "only: white is burnt, or they are negatives" in found.doubt
 
 
 def test_single_burnt_photographs_raise_no_doubt() -> None:
@@ -102,4 +109,4 @@ def test_the_negative_of_a_photograph_is_recognised() -> None:
         levels, clipped = found.appearance[:, :2], found.appearance[:, 3]
         doubts.append(light_on_discs([(found.vectors[:, :2], levels, clipped)]).doubt)
     assert doubts[0] == ""
-    assert "they look like negatives" in doubts[1]
+    assert "only: they are negatives" in doubts[1]
