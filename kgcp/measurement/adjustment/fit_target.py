@@ -29,8 +29,7 @@ from kgcp.measurement.adjustment.problem import FitProblem, apparent_tone
 from kgcp.measurement.adjustment.random_levels import even_field, fit_levels
 from kgcp.measurement.adjustment.smoothing import (
     contour_smoothing,
-    dots_growth,
-    inner_growth,
+    growth_of_print,
     with_smoothing,
 )
 from kgcp.measurement.adjustment.solver import TargetFit
@@ -264,6 +263,7 @@ def _measurement(
     if best.level_equations is not None and covariance.inflation > _UNEXPLAINED_INFLATION:
         pose_cov[:3, :3] += _spread_over_starts(best)
     other_cov = pose_covariance(other).pose_cov if ambiguity < _DOUBTFUL_AMBIGUITY else None
+    inner_growth, dots_growth = growth_of_print(best)
     measurement = Measurement(
         target=target.name,
         ring=start.ring,
@@ -274,8 +274,8 @@ def _measurement(
         heading_deg=image_heading_deg(camera, pose),
         appearance=replace(
             appearance_of(camera, target, best),
-            inner_growth=inner_growth(best),
-            dots_growth=dots_growth(best),
+            inner_growth=inner_growth,
+            dots_growth=dots_growth,
         ),
         imaging=imaging_of(best),
         alternative=Alternative(other.parameters.pose, ambiguity, other_cov),

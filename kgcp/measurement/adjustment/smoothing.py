@@ -54,23 +54,16 @@ def contour_smoothing(fit: TargetFit, inflation: float) -> ContourSmoothing | No
     )
 
 
-def inner_growth(fit: TargetFit) -> float | None:
-    """Return by how much the image shows the inner circle larger than stated, as a share.
+def growth_of_print(fit: TargetFit) -> tuple[float | None, float | None]:
+    """Return by how much the image shows inner circle and code larger than stated, as shares.
 
-    It is what the inner circle has to grow, relative to the outer one, to fit best. A circle that
-    comes nearer by a share of its distance grows by the same share. None where no pixel tells: if
-    the circle is hidden, or so far from its place that its pixels are outliers.
+    It is what the inner circle, and the circle through the dots' centres with the dots, have to
+    grow, relative to the outer circle, to fit best. What comes nearer by a share of its distance
+    grows by the same share. None where no pixel tells: if an edge is hidden, or so far from its
+    place that its pixels are outliers.
     """
-    return _growth(fit, nearest_edges(fit)[0] == 1)
-
-
-def dots_growth(fit: TargetFit) -> float | None:
-    """Return by how much the image shows the code larger than stated, as a share.
-
-    It is what the circle through the dots' centres, and the dots with it, have to grow, relative to
-    the ring, to fit best. None where no pixel tells.
-    """
-    return _growth(fit, nearest_edges(fit)[0] >= 2)
+    edge, _ = nearest_edges(fit)
+    return _growth(fit, edge == 1), _growth(fit, edge >= 2)
 
 
 def _growth(fit: TargetFit, is_at_edge: BoolArray) -> float | None:
