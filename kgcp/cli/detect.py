@@ -215,7 +215,9 @@ def command(
             )
     seconds = time.perf_counter() - start
     table = workspace.named(summary.table)
-    report(summary, table, overlay, seconds, log, as_json=as_json, doubts=doubts)
+    found = (*doubts, *summary.doubts)
+    report(summary, table, overlay, seconds, log, as_json=as_json, doubts=found)
+    print_doubts(summary.doubts, is_quiet=is_quiet, as_json=log_json)
     if is_profiled:
         report_stages(summary, start - STARTED_S, time.perf_counter() - STARTED_S, log)
     if summary.problem is not None:

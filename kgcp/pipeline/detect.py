@@ -55,6 +55,7 @@ from kgcp.pipeline.guidance import (
 from kgcp.pipeline.overlay import draw_overlay
 from kgcp.pipeline.run_summary import DetectionSummary, Stopwatch, SummaryBuilder
 from kgcp.pipeline.workspace import DETECTIONS, require_outside_frames, results_folder
+from kgcp.quality.checks.plate import check_print
 from kgcp.report.contact_sheet import ContactSheet
 from kgcp.settings import DetectSettings, require_flag, require_kind, require_range
 from kgcp.targets.plain import shape_of
@@ -232,6 +233,7 @@ def detect_flight(
             guide_problem=guide_problem,
             learnt=run.learnt,
             stages_s=_stages_s(stopwatch, journal, pool),
+            doubts=[*check_print(builder.prints, flight.all_targets, flight.camera)],
         )
         record = {**summary.numbers(), "jobs": pool.jobs, "settings": asdict(settings)}
         # after all workers have ended, because the record has their peak memory

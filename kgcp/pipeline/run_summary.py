@@ -12,7 +12,9 @@ from pathlib import Path
 
 from kgcp.errors import Reason, Status
 from kgcp.io.formats.frame_names import likely_difference
-from kgcp.measurement.records import FrameResult, Miss, TimeSource
+from kgcp.measurement.records import FrameResult, Measurement, Miss, TimeSource
+from kgcp.quality.checks.doubt import Doubt
+from kgcp.quality.checks.plate import SeenPrint
 from kgcp.quality.learnt_imaging import LearntImaging
 
 _MAX_DETAILS = 1000  # different details kept per reason; numbers in them differ between frames
@@ -20,6 +22,7 @@ _PLACE = re.compile(r"ring at \([^)]*\), radius [\d.]+ px(, |: |$)")
 _PREDICTION = re.compile(r"(^|; )expected by .*")
 _NUMBERS_OF_TEST = re.compile(r" \([^()]*\)$")
 _NUMBER = re.compile(r"-?\d+(\.\d+)?")
+_MAX_PRINTS = 10_000  # measurements that show how the targets are printed
 _MAX_COMPARED = 1000  # differing names among which two similar ones are searched for
 
 
@@ -72,6 +75,8 @@ class DetectionSummary:
         those that keep another base because they fit it much better.
     stages_s : dict of float
         Time that each stage of the work took [s].
+    doubts : tuple of Doubt
+        About the prints, from all frames together.
     """
 
     table: Path
@@ -96,6 +101,7 @@ class DetectionSummary:
     overruled_by_tone: int
     kept_other_tone: int
     stages_s: Mapping[str, float]
+    doubts: tuple[Doubt, ...]
 
     @property
     def problem(self) -> str | None:
@@ -110,8 +116,9 @@ class DetectionSummary:
         return f"{text}: {count} {reason}{detail}; {Reason.of(reason).remedy}"
 
     def numbers(self) -> dict[str, object]:
-        """Return all attributes but the table, by name, for JSON."""
-        return {name: value for name, value in asdict(self).items() if name != "table"}
+        """Return all attributes but the table and the doubts, by name, for JSON."""
+        others = {"table", "doubts"}
+        return {name: value for name, value in asdict(self).items() if name not in others}
 
 
 class Stopwatch:
@@ -154,6 +161,7 @@ class SummaryBuilder:
         self._reasons: Counter[Reason] = Counter()
         self._details: dict[Reason, Counter[str]] = defaultdict(Counter)
         self._from_exif: Counter[bool] = Counter()  # by whether the time is a whole second
+        self.prints: list[SeenPrint] = []  # of the first frames
 
     def add(self, result: FrameResult) -> None:
         """Count a frame."""
@@ -173,6 +181,15 @@ class SummaryBuilder:
             else:
                 self._status[Status.MEASURED] += 1
                 self._guided += outcome.is_guided
+                self._add_print(outcome)
+
+    def _add_print(self, measurement: Measurement) -> None:
+        appearance = measurement.appearance
+        if len(self.prints) < _MAX_PRINTS:
+            inner_growth, dots_growth = appearance.inner_growth, appearance.dots_growth
+            self.prints.append(
+                SeenPrint(measurement.target, measurement.distance_m, inner_growth, dots_growth)
+            )
 
     def _count_detail(self, miss: Miss) -> None:
         counts, text = self._details[miss.reason], _without_place(miss.detail)
@@ -191,6 +208,7 @@ class SummaryBuilder:
         guide_problem: str | None,
         learnt: LearntImaging | None,
         stages_s: Mapping[str, float],
+        doubts: Sequence[Doubt],
     ) -> DetectionSummary:
         """Return the counts together with other results of the run."""
         unused = [name for name in self._times if name not in self._named]
@@ -221,6 +239,7 @@ class SummaryBuilder:
             overruled_by_tone=0 if learnt is None else learnt.overruled,
             kept_other_tone=0 if learnt is None else learnt.kept_own_base,
             stages_s=dict(stages_s),
+            doubts=tuple(doubts),
         )
 
 

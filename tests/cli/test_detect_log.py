@@ -27,6 +27,7 @@ def _summary(table: Path, builder: SummaryBuilder | None = None) -> DetectionSum
         not_drawn=0,
         guide_problem=None,
         stages_s={},
+        doubts=(),
     )
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 from pathlib import Path
 
 import cv2
 import pandas as pd
 import pytest
 
-from tests.cli.conftest import FRAMES, SampleFlight
+from tests.cli.conftest import FRAMES, SAMPLE, SampleFlight
 
 FAST = ("--jobs", "0", "--json")
 SEEN = FRAMES[:3]  # that show the target
@@ -77,3 +79,16 @@ def test_a_quiet_run_without_a_measurement_reports_it_too(
     assert result.exit_code == 1
     assert result.stderr.startswith("kgcp: error: no target was measured in any of 3 frames: ")
     assert not (tmp_path / "kgcp").exists()
+
+
+def test_a_print_that_is_not_as_stated_is_reported_with_the_measurements(
+    unmeasured: SampleFlight,
+) -> None:
+    """Distances are a result in themselves: nobody need export points to learn that they err."""
+    for number in (1, 3, 4, 5):
+        shutil.copy(SAMPLE / "frames" / f"frame_{number:04d}.jpg", unmeasured.path / "frames")
+    unmeasured.edit(("code_diameter_m = 0.6428571428571429", "code_diameter_m = 0.6493"))
+    result = unmeasured.run("detect", *FAST)
+    last = json.loads(result.stdout)["doubts"][-1]
+    assert last["code"] == "diameters"
+    assert re.search(r"the dots of 'A' are (0\.[89]|1\.0)\d* ± 0\.\d+ % too far in", result.stderr)

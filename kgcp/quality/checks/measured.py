@@ -18,7 +18,7 @@ from kgcp.quality.checks.encounters import Encounters
 from kgcp.quality.checks.frame_header import FrameHeader
 from kgcp.quality.checks.mount import check_mount
 from kgcp.quality.checks.patterns import check_lone_frames, unexplained
-from kgcp.quality.checks.plate import check_print
+from kgcp.quality.checks.plate import SeenPrint, check_print
 from kgcp.quality.checks.static_targets import (
     check_places,
     check_static_targets,
@@ -66,7 +66,11 @@ def measured_doubts(
             if poses is None
             else check_places(sightings, static, poses, camera, target_positions.local_frame)
         )
-    of_print = [*check_print(sightings, targets, camera)]
+    prints = [
+        SeenPrint(each.target, each.distance_m, each.inner_growth, each.dots_growth)
+        for each in sightings
+    ]
+    of_print = [*check_print(prints, targets, camera)]
     doubts = [*plausibility, *of_print, *_of_altitude(sightings, headers), *of_static]
     # If an input is certainly wrong, everything that follows from it disagrees.
     if not any(doubt.is_grave for doubt in plausibility):

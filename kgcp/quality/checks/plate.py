@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.georef.sighting import Sighting
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
 from kgcp.quality.number_text import amount
 from kgcp.targets.layout import Ring, Target
@@ -83,8 +83,17 @@ def _check_layout(ring: Ring) -> Iterator[Doubt]:
     yield mild(Cause.LAYOUT, problem, remedy, figures)
 
 
+class SeenPrint(NamedTuple):
+    """What one frame shows of a target's print."""
+
+    target: str
+    distance_m: float
+    inner_growth: float | None  # as in `Appearance`
+    dots_growth: float | None
+
+
 def check_print(
-    sightings: Sequence[Sighting], targets: Sequence[AnyTarget], camera: Camera
+    prints: Sequence[SeenPrint], targets: Sequence[AnyTarget], camera: Camera
 ) -> Iterator[Doubt]:
     """Yield the doubt about a printed inner circle or code that is not as stated for its ring.
 
@@ -94,7 +103,7 @@ def check_print(
     for target in targets:
         if not isinstance(target, Target):
             continue
-        of_target = [each for each in sightings if each.target == target.name]
+        of_target = [each for each in prints if each.target == target.name]
         ring = target.ring
         inner = _seen_growth(
             [(each.distance_m, each.inner_growth) for each in of_target],

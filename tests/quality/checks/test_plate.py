@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from kgcp.geometry.camera import Camera
-from kgcp.georef.sighting import Sighting
 from kgcp.quality.checks.doubt import Cause
-from kgcp.quality.checks.plate import check_plates, check_print
+from kgcp.quality.checks.plate import SeenPrint, check_plates, check_print
 from kgcp.targets.layout import Ring, Target
 
 SEVEN_DEG = (0.0, 50.0, 102.0, 155.0, 206.0, 258.0, 311.0)
@@ -63,13 +61,6 @@ def test_diameters_in_other_units_are_reported(outer_m: float, words: str) -> No
 CAMERA = Camera(1200, 900, 1900.0, 1900.0, 600.0, 450.0)
 
 
-def sighting(distance_m: float, growth: float, of_dots: float | None = None) -> Sighting:
-    frame = f"{distance_m:.3f}.png"
-    at = np.array([600.0, 450.0])
-    seen = Sighting(frame, 1, "A", 0, None, at, None, distance_m, None, None)
-    return replace(seen, inner_growth=growth, dots_growth=of_dots)
-
-
 @pytest.mark.parametrize(
     ("growth", "edge_px", "frames", "words"),
     [
@@ -90,8 +81,9 @@ def test_an_inner_circle_that_is_not_as_stated_in_all_frames_is_reported(
     radii_px = 0.225 * CAMERA.mean_focal_px / distances_m
     seen = growth + edge_px / radii_px + 0.02 * radii_px**-1.5 * rng.standard_normal(frames)
     seen[2] = 0.2  # something hid the circle
-    sightings = [*map(sighting, distances_m.tolist(), seen.tolist())]
-    doubts = [*check_print(sightings, [target()], CAMERA)]
+    pairs = zip(distances_m.tolist(), seen.tolist(), strict=True)
+    prints = [SeenPrint("A", distance_m, inner, None) for distance_m, inner in pairs]
+    doubts = [*check_print(prints, [target()], CAMERA)]
     assert [doubt.code for doubt in doubts] == [Cause.DIAMETERS] * bool(words)
     for doubt in doubts:
         assert words in doubt.sentence
@@ -116,7 +108,9 @@ def test_dots_that_are_not_as_stated_are_told_from_a_wrong_inner_circle(
     distances_m = np.geomspace(9.0, 50.0, 24)
     noise = 0.02 * (0.3 * CAMERA.mean_focal_px / distances_m) ** -1.5
     seen = np.array([[inner], [dots]]) + noise * rng.standard_normal((2, 24))
-    sightings = [*map(sighting, distances_m.tolist(), seen[0].tolist(), seen[1].tolist())]
-    doubts = [*check_print(sightings, [target()], CAMERA)]
+    prints = [
+        SeenPrint("A", *each) for each in zip(distances_m.tolist(), *seen.tolist(), strict=True)
+    ]
+    doubts = [*check_print(prints, [target()], CAMERA)]
     assert [doubt.code for doubt in doubts] == [Cause.DIAMETERS] * bool(words)
     assert all(words in doubt.sentence for doubt in doubts)
