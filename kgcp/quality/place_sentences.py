@@ -48,12 +48,14 @@ def diameter_sentence(placed: PlacedTarget) -> str:
     sd = placed.sd_diameter_m
     decimals = 4 if not sd > 0.0 else min(7, max(4, 1 - math.floor(math.log10(sd))))
     ratio = _diameter_ratio(placed)
-    verdict = "which is not what" if has_other_diameter(placed) else "as"
+    verdict = "as flight.toml says"
+    if has_other_diameter(placed):
+        verdict = "which is not what flight.toml says; measure the print"
     return (
         f"{placed.target}: the diameter of {check.stated_diameter_m:g} m measures"
         f" {placed.diameter_m:.{decimals}f} ± {sd:.{decimals}f} m"
         f" ({minus(f'{check.diameter_permille:+.2f}')} ‰, {ratio:.1f} standard deviations),"
-        f" {verdict} flight.toml says"
+        f" {verdict}"
     )
 
 
@@ -84,8 +86,12 @@ def position_sentence(placed: PlacedTarget) -> str:
     if check.is_rough:
         remedy = "; check position_m and crs" if is_doubtful else ""
         return f"{lies}, which states no sd_position_m{remedy}"
-    verdict = "more than the standard deviations explain" if is_doubtful else "as expected"
-    return f"{lies}, {verdict} (χ² = {chi2:.1f} for 3 coordinates)"
+    if not is_doubtful:
+        return f"{lies}, as expected (χ² = {chi2:.1f} for 3 coordinates)"
+    return (
+        f"{lies}, more than the standard deviations explain (χ² = {chi2:.1f} for 3 coordinates);"
+        " check position_m, its datum and that of the poses, and whether the target was moved"
+    )
 
 
 def contradictions(placed: PlacedTarget) -> Iterator[str]:
