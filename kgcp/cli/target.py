@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 # Repeated here because the modules that define them import numpy; a test compares them.
 FORMATS = ("pdf", "svg", "dxf", "png")
 PAPERS = ("fit", "A4", "A3", "A2", "A1", "A0")
+
+_JOINED_SD_M = 0.0005  # of places in a plane on sheets that are cut and joined by hand
 
 
 @click.command()
@@ -249,6 +252,9 @@ def _draw_field(
     except SettingError as error:
         raise KgcpError(f"{text}: {error}", option="field") from error
     sheets = lay_out(drawing, "the field", paper, is_tiled=is_tiled)
+    if len(sheets) > 1:
+        x_m, y_m, z_m = field.flat_sd_m
+        field = replace(field, flat_sd_m=(max(x_m, _JOINED_SD_M), max(y_m, _JOINED_SD_M), z_m))
     folder = out or Path("targets")
     description = folder / "field.toml"
     refuse_to_overwrite_field(text, [description])

@@ -166,6 +166,16 @@ def test_a_field_is_drawn_with_its_field_toml(tmp_path: Path) -> None:
     assert steps == pytest.approx(25.0 / 25.4 * 100.0, abs=0.3)
 
 
+def test_a_field_on_joined_sheets_is_stated_less_accurately(tmp_path: Path) -> None:
+    arguments = ["target", "--field", "grid:9x6:25mm:14mm", "--sheet", "A4", "--format", "svg"]
+    assert CliRunner().invoke(main, [*arguments, "--out", str(tmp_path / "one")]).exit_code == 0
+    arguments[2] = "grid:9x8:30mm:14mm"
+    arguments += ["--tiled", "--out", str(tmp_path / "tiles")]
+    assert CliRunner().invoke(main, arguments).exit_code == 0
+    stated = [read_field(str(tmp_path / name / "field.toml")) for name in ("one", "tiles")]
+    assert [field.flat_sd_m for field in stated] == [(5e-5, 5e-5, 3e-4), (5e-4, 5e-4, 3e-4)]
+
+
 _POINTS = """
 name = "panel"
 diameter_m = 0.012
