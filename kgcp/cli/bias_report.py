@@ -10,6 +10,7 @@ import click
 from kgcp.cli.doubts import print_doubts
 from kgcp.cli.options import (
     detections_option,
+    exclude_option,
     flight_place_argument,
     json_option,
     out_place_option,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Measure N frames, near and far, again with darker and brighter grey values; 0 skips it.",
 )
+@exclude_option
 @quiet_option
 @json_option
 def command(
@@ -39,6 +41,7 @@ def command(
     out: Path | StoredFolder | None,
     detections: Path | None,
     reexpose: int,
+    exclude_files: tuple[Path, ...],
     *,
     is_quiet: bool,
     as_json: bool,
@@ -57,11 +60,18 @@ def command(
     from kgcp.report.plotting import load_matplotlib
 
     load_matplotlib()  # before the report does
+    from kgcp.io.formats.exclusions import read_exclusions
     from kgcp.pipeline.bias_report import bias_study
+    from kgcp.pipeline.exclude import excluded_rows, rows_of
+    from kgcp.quality.number_text import counted
 
+    exclusions = [line for file in exclude_files for line in read_exclusions(file)]
     with open_workspace(flight, out, (DETECTIONS,)) as workspace:
         the_flight = read_flight(workspace.flight)
-        bias = bias_study(the_flight, workspace.detections(detections))
+        table = workspace.detections(detections)
+        rows = {the_flight.name: rows_of(table)} if exclusions else {}
+        excluded = excluded_rows(exclusions, rows).get(the_flight.name, ())
+        bias = bias_study(the_flight, table, excluded=excluded)
         print_doubts(bias.doubts, is_quiet=is_quiet)
         with sole_writer(workspace.out, "bias-report"):
             report = bias.write_report(
@@ -74,6 +84,8 @@ def command(
         click.echo(json.dumps({**report.summary(), "files": files}))
     if is_quiet:
         return
+    if bias.left_out:
+        click.echo(f"{counted(bias.left_out, 'measurement')} left out (--exclude)", err=True)
     for sentence in report.verdict.sentences:
         click.echo(sentence, err=True)
     for path in report.files:

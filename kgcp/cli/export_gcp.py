@@ -12,9 +12,9 @@ import click
 
 from kgcp.cli.doubts import print_doubts
 from kgcp.cli.options import (
-    LocalPath,
     NumberRange,
     detections_option,
+    exclude_option,
     flight_places_argument,
     json_option,
     out_place_option,
@@ -88,15 +88,7 @@ def _list_formats(context: click.Context, _: click.Parameter, asked: bool) -> No
     show_default=True,
     help="Names of images for metashape and realityscan, whose projects may lack the extension.",
 )
-@click.option(
-    "--exclude",
-    "exclude_files",
-    metavar="FILE",
-    type=LocalPath(),
-    multiple=True,
-    help="Leave out the frames that this file lists, one per line, or single targets in them"
-    " (frame,target), as the contact sheet of 'kgcp detect --overlay' writes it; may be repeated.",
-)
+@exclude_option
 @click.option(
     "--flight-ids",
     is_flag=True,

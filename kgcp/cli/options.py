@@ -118,6 +118,16 @@ detections_option = click.option(
     help="Table written by 'kgcp detect'.  [default: detections.parquet in the results' folder]",
 )
 
+exclude_option = click.option(
+    "--exclude",
+    "exclude_files",
+    metavar="FILE",
+    type=LocalPath(),
+    multiple=True,
+    help="Leave out the frames that this file lists, one per line, or single targets in them"
+    " (frame,target), as the contact sheet of 'kgcp detect --overlay' writes it; may be repeated.",
+)
+
 unit_option = click.option(
     "--unit",
     type=click.Choice(("mm", "cm", "m", "in")),

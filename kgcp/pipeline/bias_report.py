@@ -14,6 +14,7 @@ from kgcp.errors import KgcpError, Rejection
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
+from kgcp.georef.selection import Selection
 from kgcp.io.files.atomic import remove, write_bytes
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight, require_flight
@@ -30,6 +31,7 @@ from kgcp.io.tables.gcps import BIAS_COLUMNS, bias_row
 from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.provenance import derived_provenance
 from kgcp.measurement.image_model.window import contour_px
+from kgcp.pipeline.exclude import FrameAndTarget, without_excluded
 from kgcp.pipeline.execution.signals import defer_interrupts
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.flight_inputs import FlightInputs, naming_causes
@@ -102,6 +104,8 @@ class FlightBias:
         Agreement of vehicle and camera; None: too few frames to compare.
     learnt : LearntImaging or None
         Properties of the camera learnt from all frames together; None: nothing was learnt.
+    left_out : int
+        Measurements that the user excluded.
     """
 
     flight: Flight
@@ -112,6 +116,7 @@ class FlightBias:
     outcomes: Outcomes | None = None
     consistency: Consistency | None = None
     learnt: LearntImaging | None = None
+    left_out: int = 0
 
     def summary(self) -> Json:
         """Return the numbers of `bias_summary.json`, but without those of re-exposed frames."""
@@ -191,7 +196,9 @@ class FlightBias:
         return Content(
             name=self.flight.name,
             headline=headline(self.flight, self.outcomes),
-            facts=facts(self.flight, self.settings, self.outcomes, self.provenance),
+            facts=facts(
+                self.flight, self.settings, self.outcomes, self.provenance, left_out=self.left_out
+            ),
             agreement=agreement(consistency, self.doubts),
             doubts=self.doubts,
             numbers=numbers,
@@ -206,13 +213,20 @@ class FlightBias:
 
 
 @single_threaded()
-def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBias:
+def bias_study(
+    flight: Flight,
+    detections: Path | str | None = None,
+    *,
+    excluded: Sequence[FrameAndTarget] = (),
+) -> FlightBias:
     """Compare the distances of a flight's detections with its reference poses.
 
     Parameters
     ----------
     detections : Path, optional
         The table that `detect_flight` wrote; by default that of the flight's results folder.
+    excluded : sequence of (str, str)
+        What to leave out, as in `Selection`.
 
     Raises
     ------
@@ -221,7 +235,9 @@ def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBi
     """
     require_flight(flight)
     table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
-    attempts = read_attempts(table, flight)
+    pairs = Selection(excluded=tuple(excluded)).excluded
+    read = read_attempts(table, flight)
+    attempts = without_excluded(read, pairs, table)
     settings = read_settings(table)
     data = FlightData(flight, [attempt.frame for attempt in attempts])
     inputs = FlightInputs.detected(flight, data, attempts)
@@ -238,7 +254,8 @@ def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBi
         )
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
     consistency, doubts = inputs.compared(sightings)
-    provenance = derived_provenance(flight, table, {}, has_reference=True)
+    choices = {"excluded": pairs} if pairs else {}
+    provenance = derived_provenance(flight, table, choices, has_reference=True)
     return FlightBias(
         flight=flight,
         settings=settings,
@@ -248,6 +265,7 @@ def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBi
         outcomes=read_outcomes(table),
         consistency=consistency,
         learnt=read_learnt_imaging(table),
+        left_out=sum(attempt.sighting is not None for attempt in read) - len(sightings),
     )
 
 

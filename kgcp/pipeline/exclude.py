@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from kgcp.errors import KgcpError, KgcpWarning
+from kgcp.georef.sighting import Attempt
 from kgcp.io.formats.exclusions import Exclusion
 from kgcp.io.tables.detections import read_detections
 from kgcp.quality.number_text import counted
@@ -84,6 +85,25 @@ def warn_of_unknown(pairs: Iterable[FrameAndTarget], table: Path) -> None:
     exclusions = [Exclusion("", frame, target) for frame, target in pairs]
     if exclusions:
         excluded_rows(exclusions, {"": rows_of(table)})
+
+
+def without_excluded(
+    attempts: Sequence[Attempt], pairs: Sequence[FrameAndTarget], table: Path
+) -> list[Attempt]:
+    """Return the attempts that are not excluded; warn of pairs that match no row of the table.
+
+    Parameters
+    ----------
+    pairs : sequence of (str, str)
+        As in `Selection.excluded`.
+    """
+    warn_of_unknown(pairs, table)
+    unwanted = set(pairs)
+    return [
+        attempt
+        for attempt in attempts
+        if unwanted.isdisjoint({(attempt.frame, ""), (attempt.frame, attempt.target)})
+    ]
 
 
 def _warn(unknown: Sequence[Exclusion]) -> None:

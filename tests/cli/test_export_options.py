@@ -336,3 +336,18 @@ def test_two_exports_do_not_write_to_one_folder(folder: Path) -> None:
     assert not (folder / "kgcp" / "kgcps.parquet").exists()
     assert _export(folder).exit_code == 0
     assert not [*(folder / "kgcp").glob(".*")]
+
+
+def test_a_bias_report_leaves_out_what_an_export_does(folder: Path) -> None:
+    """A ring of which a person has seen that it is not the target counts in neither."""
+    unwanted = folder / "exclude.csv"
+    unwanted.write_text("f_20.jpg\nf_3.jpg\n", encoding="utf-8")
+    arguments = ["bias-report", str(folder), "--reexpose", "0", "--exclude", str(unwanted)]
+    result = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert "1 exclusion without a row in the detections (f_3.jpg)" in result.stderr
+    assert result.exit_code == 0, result.output
+    assert "1 measurement left out (--exclude)" in result.stderr
+    frames = pq.read_table(folder / "kgcp" / "bias.parquet")["frame"].to_pylist()
+    assert len(frames) == _FRAMES - 1
+    assert "f_20.jpg" not in frames
+    assert "Left out by hand" in (folder / "kgcp" / "bias_report.html").read_text(encoding="utf-8")

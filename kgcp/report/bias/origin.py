@@ -14,7 +14,7 @@ from kgcp.io.tables.detections import Outcomes
 from kgcp.quality.advice import agrees, is_explained, rms_m
 from kgcp.quality.checks.doubt import Doubt
 from kgcp.quality.consistency import Consistency
-from kgcp.quality.number_text import minus
+from kgcp.quality.number_text import counted, minus
 from kgcp.settings import DetectSettings, Method
 from kgcp.targets.layout import Target
 from kgcp.targets.plain import AnyTarget, PlainTarget
@@ -49,6 +49,8 @@ def facts(
     settings: DetectSettings,
     outcomes: Outcomes | None,
     provenance: Mapping[str, str],
+    *,
+    left_out: int = 0,
 ) -> tuple[Fact, ...]:
     """Return the inputs and settings of a report, line by line.
 
@@ -58,10 +60,14 @@ def facts(
         Of the table of detections; None: there is none.
     provenance : mapping of str
         The metadata of `bias.parquet`.
+    left_out : int
+        Measurements that the user excluded.
     """
+    by_hand = [Fact("Left out by hand", counted(left_out, "measurement"))] if left_out else []
     return (
         Fact("Program", _program(provenance)),
         *_frames(outcomes),
+        *by_hand,
         Fact("Camera", _camera(flight)),
         *(Fact("Target", _target(target)) for target in flight.targets),
         *(Fact("Target", _plain(target)) for target in flight.plain_targets),
