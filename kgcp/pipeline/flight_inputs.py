@@ -241,8 +241,8 @@ class FlightInputs:
             doubts += check_lever_arm(flight.vehicle.settings, moving)
             doubts += check_vehicle_deviations(flight.vehicle.settings)
         if self.target_positions is not None and not _has_wrong_places(doubts):
-            doubts += check_attitude(self.course)
             if self.target_positions.vehicle is not None:
+                doubts += check_attitude(self.course, self.target_positions.vehicle.settings)
                 doubts += check_spikes(self.target_positions.vehicle.motion)
                 doubts += check_deviations(self.target_positions.vehicle.motion)
             if self.reference_poses is not None:

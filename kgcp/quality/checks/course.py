@@ -8,12 +8,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.georef.target_positions import Vehicle
-from kgcp.quality.checks.doubt import Cause, Doubt, grave
+from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
+from kgcp.quality.number_text import amount, minus, rounded
+from kgcp.settings import VehicleSettings
 
 _MAX_OFF_DEG = 20.0  # of headings from the course; crab angles and GNSS noise are far smaller
 _MAX_FITTING_DEG = 8.0  # the same of another reading of the headings that fits
+# A smaller steady offset displaces the target, too. Where the path turns by 0.17° per metre, a
+# point 3 m before the rear axle moves half a degree aside of the heading; more would hide it.
+_MAX_TURN_DEG_M = 0.17
+_MIN_STEADY_DEG, _MIN_STEADY_SDS, _MIN_STEADY_STATED_SDS = 1.5, 5.0, 3.0
+_PART_S, _MIN_PARTS = 5.0, 4  # of the drive, whose medians must agree
+_MIN_ASIDE_M = 0.01  # displacement of the target
+_MIN_CONVERGENCE_DEG, _CONVERGENCE_TOLERANCE_DEG = 1.0, 0.5
 _MAX_TILT_DEG = 35.0
 # Half the base of a course: over one interval of a fast logger it would be mere noise.
 _HALF_BASE_S = 0.5
@@ -27,8 +36,12 @@ _MAX_EPOCHS = 20_000  # more would tell nothing new
 class Course:
     """Course and attitude of a moving vehicle at n epochs."""
 
+    time_s: FloatArray  # (n,): since the first epoch [s]
     course_deg: FloatArray  # (n,): direction of motion, clockwise from true north [deg]
     attitude_deg: FloatArray  # (n, 3): roll, pitch, heading as in the trajectory [deg]
+    is_straight: BoolArray  # (n,): whether the path hardly bends
+    sd_heading_deg: float  # stated standard deviation, median; 0: not stated
+    convergence_deg: float  # direction of grid north, clockwise from true north [deg]
 
     @property
     def median_off_deg(self) -> float:
@@ -59,19 +72,34 @@ def course_of(vehicle: Vehicle, attitude_deg: FloatArray) -> Course | None:
     level = vehicle.local_frame.level_rotations(motion.position_m[::step])
     east, north, _ = np.einsum("nji,nj->in", level, chord)
     base_s = np.minimum(end, since[-1]) - np.maximum(start, 0.0)
-    moves = np.hypot(east, north) > _MIN_SPEED_M_S * base_s
+    way_m = np.hypot(east, north)
+    moves = way_m > _MIN_SPEED_M_S * base_s
     if np.count_nonzero(moves) < _MIN_EPOCHS:
         return None
-    return Course(np.degrees(np.arctan2(east, north))[moves], attitude_deg[::step][moves])
+    heading = np.unwrap(attitude_deg[:, 2], period=360.0)
+    turn_deg = np.interp(end, since, heading) - np.interp(start, since, heading)
+    sds = motion.sd_attitude_deg
+    grid_north = vehicle.local_frame.grid_rotation(motion.position_m[0])[:, 1]
+    return Course(
+        time_s=middle[moves],
+        course_deg=np.degrees(np.arctan2(east, north))[moves],
+        attitude_deg=attitude_deg[::step][moves],
+        is_straight=(np.abs(turn_deg) < _MAX_TURN_DEG_M * way_m)[moves],
+        sd_heading_deg=0.0 if sds is None else float(np.median(sds[:, 2])),
+        convergence_deg=math.degrees(math.atan2(grid_north[0], grid_north[1])),
+    )
 
 
-def check_attitude(course: Course | None) -> Iterator[Doubt]:
+def check_attitude(course: Course | None, settings: VehicleSettings) -> Iterator[Doubt]:
     """Compare headings with the course, and roll and pitch with a level road.
 
     If they do not fit, other usual conventions are tried, and those that fit are named.
     """
     if course is not None:
-        yield from _check_heading(course)
+        if course.median_off_deg > _MAX_OFF_DEG:
+            yield _wrong_heading(course)
+        else:
+            yield from _check_steady_offset(course, settings)
         yield from _check_level(course)
 
 
@@ -110,22 +138,19 @@ _ANTICLOCKWISE_FROM_EAST = 1
 _RADIANS = 3, 4
 
 
-def _check_heading(course: Course) -> Iterator[Doubt]:
-    """Compare headings with the course; if they differ, name the readings that fit."""
+def _wrong_heading(course: Course) -> Doubt:
+    """Return the doubt about headings in other directions than the course; it names what fits."""
     heading = course.attitude_deg[:, 2]
     off = course.median_off_deg
-    if off <= _MAX_OFF_DEG:
-        return
     figures = {"median_off_deg": off, "epochs": float(len(heading))}
     if not np.any(heading):
-        yield grave(
+        return grave(
             Cause.HEADING,
             "headings are 0 at all epochs, but the vehicle drives in other directions",
             'give a trajectory with attitude, or [vehicle] attitude = "course" with'
             " sd_attitude_deg",
             figures,
         )
-        return
     sentence = f"headings are {off:.0f}° from the course over ground while driving (median)"
     may_be_radians = bool(np.all(np.abs(_wrapped(heading)) <= 2.0 * math.pi + 0.01))
     fits = []
@@ -141,23 +166,68 @@ def _check_heading(course: Course) -> Iterator[Doubt]:
         enough = 2.0 * min((fit[0] for fit in fits), default=0.0) + 1.0
         fits.sort(key=lambda fit: (fit[0] > enough, fit[1]))
     if not fits:
-        yield grave(
+        return grave(
             Cause.HEADING,
             f"{sentence}, and no other convention fits",
             "check the columns roll_deg, pitch_deg, heading_deg and the order of x and y",
             figures,
         )
-        return
     converted_off, index, words, remedy = fits[0]
     code = Cause.ANGLE_UNIT if index in (*_RADIANS, 5) else Cause.HEADING
     others = "".join(f", or {fit[2]}" for fit in fits[1:3])
     if index == _ANTICLOCKWISE_FROM_EAST:
         remedy += ", unless x and y of the trajectory are exchanged"
-    yield grave(
+    return grave(
         code,
         f"{sentence}: they seem to be {words}{others}",
         remedy,
         {**figures, "left_deg": converted_off},
+    )
+
+
+def _check_steady_offset(course: Course, settings: VehicleSettings) -> Iterator[Doubt]:
+    """Yield the doubt about headings that differ from the course alike wherever it is straight.
+
+    They turn the lever arm, and nothing but reference poses would show it.
+    """
+    straight = course.is_straight
+    off = _wrapped(course.attitude_deg[straight, 2] - course.course_deg[straight])
+    part = np.floor(course.time_s[straight] / _PART_S)
+    medians = np.array([np.median(off[part == number]) for number in np.unique(part)])
+    if len(medians) < _MIN_PARTS:
+        return
+    steady = float(np.median(off))
+    sd = float(np.std(medians, ddof=1)) / math.sqrt(len(medians))
+    least = max(
+        _MIN_STEADY_DEG,
+        _MIN_STEADY_SDS * sd,
+        _MIN_STEADY_STATED_SDS * course.sd_heading_deg,
+        float(np.ptp(np.percentile(medians, [5.0, 95.0]))),  # more is not steady
+    )
+    forward, right, _ = settings.lever_arm_m
+    aside_m = math.hypot(forward, right) * math.radians(abs(steady))
+    if abs(steady) < least or aside_m < _MIN_ASIDE_M:
+        return
+    side = "clockwise" if steady > 0.0 else "anticlockwise"
+    yield mild(
+        Cause.HEADING,
+        f"where the vehicle drives straight, headings are {amount(abs(steady), sd)}° {side} of the"
+        f" course: with this lever arm, that displaces the target by {rounded(aside_m)} m",
+        _remedy_of_steady_offset(steady, course.convergence_deg),
+        {"steady_off_deg": steady, "sd_off_deg": sd, "aside_m": aside_m},
+    )
+
+
+def _remedy_of_steady_offset(off_deg: float, convergence_deg: float) -> str:
+    is_by_grid = abs(off_deg + convergence_deg) < _CONVERGENCE_TOLERANCE_DEG
+    if is_by_grid and abs(convergence_deg) > _MIN_CONVERGENCE_DEG:
+        return (
+            "give headings relative to true north: they seem to be relative to grid north; add the"
+            f" meridian convergence, here {minus(f'{convergence_deg:.1f}')}°"
+        )
+    return (
+        "give headings of the axes along which lever_arm_m is measured, relative to true north,"
+        " neither to magnetic nor to grid north, and check crs"
     )
 
 

@@ -67,7 +67,7 @@ class Cause(StrEnum):
     CRS = "crs", "the coordinates are not in the CRS that is named"
     HEADING = (
         "heading",
-        "headings do not follow the course: they have another zero direction or sense of rotation",
+        "headings do not follow the course: another zero direction or sense, or an offset",
     )
     ATTITUDE = "attitude", "roll or pitch are not those of a vehicle on a road"
     TRAJECTORY_SPIKE = (

@@ -14,6 +14,8 @@ from kgcp.quality.checks.doubt import Cause
 from kgcp.quality.checks.lever_arm import check_lever_arm, lever_arm_text
 from kgcp.settings import VehicleSettings
 
+ARM = VehicleSettings(lever_arm_m=(-0.8, 0.15, -1.95))
+ORIGIN = np.array([689586.0, 5336252.0, 500.0])  # grid north is 1.9° from true north there
 TIME_S = np.arange(0.0, 60.0, 0.05)
 ANGLE = 0.05 * TIME_S + 0.3
 
@@ -23,23 +25,40 @@ def drive(
     roll: float = 0.3,
 ) -> Course | None:
     """A bend of nearly half a circle to the left, first to the north."""
-    origin = np.array([689586.0, 5336252.0, 500.0])
     xy = 150.0 * np.column_stack((np.cos(ANGLE), np.sin(ANGLE)))
     course = (-np.degrees(ANGLE)) % 360.0
-    # grid north is 1.9° from true north there, far less than the conventions differ by
     attitude = np.column_stack((0 * course + roll, 0 * course, turned(course)))
-    position = origin + np.column_stack((xy, 0.0 * TIME_S))
-    trajectory = Trajectory(TIME_S, position, attitude, None, None)
-    vehicle = Vehicle.on(trajectory, VehicleSettings(), LocalFrame.at("EPSG:25832", origin))
-    return course_of(vehicle, attitude)
+    return course_along(ORIGIN + np.column_stack((xy, 0.0 * TIME_S)), attitude)
+
+
+def course_along(
+    position: FloatArray, attitude: FloatArray, sd_attitude_deg: FloatArray | None = None
+) -> Course | None:
+    trajectory = Trajectory(TIME_S, position, attitude, None, sd_attitude_deg)
+    return course_of(Vehicle.on(trajectory, ARM, LocalFrame.at("EPSG:25832", ORIGIN)), attitude)
+
+
+def straight_drive(
+    heading_deg: float, *, grid_deg: float = 30.0, stated_deg: float = 0.3
+) -> Course:
+    """A drive at 10 m/s in one direction of the grid, with noise in positions and headings."""
+    rng = np.random.default_rng(3)
+    azimuth = np.radians(grid_deg)
+    way = np.outer(10.0 * TIME_S, [np.sin(azimuth), np.cos(azimuth), 0.0])
+    position = ORIGIN + way + 0.01 * rng.standard_normal(way.shape)
+    heading = heading_deg + 0.3 * rng.standard_normal(len(TIME_S))
+    attitude = np.column_stack((0.0 * heading, 0.0 * heading, heading))
+    course = course_along(position, attitude, np.full(attitude.shape, stated_deg))
+    assert course is not None
+    return course
 
 
 def test_headings_along_the_course_raise_no_doubt() -> None:
     course = drive()
     assert course is not None
     assert course.median_off_deg == pytest.approx(1.9, abs=0.3)
-    assert not [*check_attitude(course)]
-    assert not [*check_attitude(drive(lambda heading: heading + 15.0))]
+    assert not [*check_attitude(course, ARM)]
+    assert not [*check_attitude(drive(lambda heading: heading + 15.0), ARM)]
 
 
 @pytest.mark.parametrize(
@@ -58,22 +77,45 @@ def test_headings_along_the_course_raise_no_doubt() -> None:
 def test_the_heading_convention_that_fits_is_named(
     turned: Callable[[FloatArray], FloatArray], code: Cause, words: str
 ) -> None:
-    (doubt,) = check_attitude(drive(turned))
+    (doubt,) = check_attitude(drive(turned), ARM)
     assert doubt.is_grave
     assert doubt.code is code
     assert words in doubt.sentence.partition(", or ")[0]
 
 
+@pytest.mark.parametrize(
+    ("heading_deg", "stated_deg", "words"),
+    [
+        (31.9, 0.3, ""),
+        (31.0, 0.3, ""),  # less than drivers and axes differ by
+        (30.0, 0.3, "are 1.91"),
+        (36.0, 0.3, "are 4.08"),
+        (36.0, 2.0, ""),  # as stated
+    ],
+)
+def test_a_steady_offset_of_headings_is_reported(
+    heading_deg: float, stated_deg: float, words: str
+) -> None:
+    course = straight_drive(heading_deg, stated_deg=stated_deg)
+    doubts = [*check_attitude(course, ARM)]
+    assert [doubt.code for doubt in doubts] == [Cause.HEADING] * bool(words)
+    for doubt in doubts:
+        assert words in doubt.sentence
+        assert not doubt.is_grave
+        by_grid = "add the meridian convergence, here 1.9°" in doubt.remedy
+        assert by_grid == (heading_deg == 30.0)
+    assert not [*check_attitude(course, VehicleSettings(lever_arm_m=(0.0, 0.0, -2.0)))]
+
+
 def test_on_a_straight_line_all_fitting_heading_conventions_are_named() -> None:
-    course = np.full(100, 90.0)
-    attitude = np.column_stack((np.zeros((100, 2)), np.full(100, 270.0)))
-    (doubt,) = check_attitude(Course(course, attitude))
+    course = straight_drive(heading_deg=270.0, grid_deg=90.0)
+    (doubt,) = check_attitude(course, ARM)
     assert "180° from the course" in doubt.sentence
     assert "anticlockwise from" in doubt.sentence
 
 
 def test_axes_that_point_up_are_reported() -> None:
-    (doubt,) = check_attitude(drive(roll=179.5))
+    (doubt,) = check_attitude(drive(roll=179.5), ARM)
     assert doubt.code is Cause.ATTITUDE
     assert "its z axis points up" in doubt.sentence
 
@@ -84,7 +126,7 @@ def test_a_vehicle_that_stands_has_no_course() -> None:
     standing = Trajectory(TIME_S, position, attitude, None, None)
     frame = LocalFrame.at("EPSG:25832", position[0])
     assert course_of(Vehicle.on(standing, VehicleSettings(), frame), attitude) is None
-    assert not [*check_attitude(None)]
+    assert not [*check_attitude(None, ARM)]
 
 
 def test_lever_arms_are_described_and_implausible_ones_are_doubted() -> None:
