@@ -37,7 +37,7 @@ from kgcp.quality.checks.clock import (
     check_overlap,
     check_same_times,
 )
-from kgcp.quality.checks.course import Course, check_attitude, course_of
+from kgcp.quality.checks.course import Course, check_attitude, check_steady_offsets, course_of
 from kgcp.quality.checks.deviations import (
     check_deviations,
     check_pose_deviations,
@@ -241,8 +241,9 @@ class FlightInputs:
             doubts += check_lever_arm(flight.vehicle.settings, moving)
             doubts += check_vehicle_deviations(flight.vehicle.settings)
         if self.target_positions is not None and not _has_wrong_places(doubts):
+            doubts += check_attitude(self.course)
             if self.target_positions.vehicle is not None:
-                doubts += check_attitude(self.course, self.target_positions.vehicle.settings)
+                doubts += check_steady_offsets(self.course, self.target_positions.vehicle.settings)
                 doubts += check_spikes(self.target_positions.vehicle.motion)
                 doubts += check_deviations(self.target_positions.vehicle.motion)
             if self.reference_poses is not None:

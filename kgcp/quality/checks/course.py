@@ -16,14 +16,25 @@ from kgcp.settings import VehicleSettings
 
 _MAX_OFF_DEG = 20.0  # of headings from the course; crab angles and GNSS noise are far smaller
 _MAX_FITTING_DEG = 8.0  # the same of another reading of the headings that fits
-# A smaller steady offset displaces the target, too. Where the path turns by 0.17° per metre, a
-# point 3 m before the rear axle moves half a degree aside of the heading; more would hide it.
+# Where the path turns by 0.17° per metre, a point 3 m before the rear axle moves half a degree
+# aside of the heading.
 _MAX_TURN_DEG_M = 0.17
-_MIN_STEADY_DEG, _MIN_STEADY_SDS, _MIN_STEADY_STATED_SDS = 1.5, 5.0, 3.0
-_PART_S, _MIN_PARTS = 5.0, 4  # of the drive, whose medians must agree
-_MIN_ASIDE_M = 0.01  # displacement of the target
-_MIN_CONVERGENCE_DEG, _CONVERGENCE_TOLERANCE_DEG = 1.0, 0.5
 _MAX_TILT_DEG = 35.0
+# Least offsets that are doubted. Bodies are pitched by a degree or so against the road, which
+# itself falls by up to 1.5° to its edge, and by 4° only in bends.
+_MIN_HEADING_DEG, _MIN_PITCH_DEG, _MIN_ROLL_DEG = 1.5, 2.5, 4.0
+_MIN_SDS, _MIN_STATED_SDS = 5.0, 3.0
+_MIN_ASIDE_M = 0.01  # displacement of the target
+_PART_S, _MIN_PARTS = 5.0, 4  # of the drive, whose medians must agree
+_MIN_CONVERGENCE_DEG, _CONVERGENCE_TOLERANCE_DEG = 1.0, 0.5
+_OF_HEADING = (
+    "give headings of the axes along which lever_arm_m is measured, relative to true north, neither"
+    " to magnetic nor to grid north, and check crs"
+)
+_OF_TILT = (
+    "give roll and pitch of the axes along which lever_arm_m is measured: those of the instrument"
+    " may be turned against the vehicle's"
+)
 # Half the base of a course: over one interval of a fast logger it would be mere noise.
 _HALF_BASE_S = 0.5
 _MIN_SPEED_M_S = 1.0
@@ -38,9 +49,10 @@ class Course:
 
     time_s: FloatArray  # (n,): since the first epoch [s]
     course_deg: FloatArray  # (n,): direction of motion, clockwise from true north [deg]
+    slope_deg: FloatArray  # (n,): of the path, upwards [deg]
     attitude_deg: FloatArray  # (n, 3): roll, pitch, heading as in the trajectory [deg]
     is_straight: BoolArray  # (n,): whether the path hardly bends
-    sd_heading_deg: float  # stated standard deviation, median; 0: not stated
+    sd_attitude_deg: FloatArray  # (3,): stated standard deviations, medians; 0: not stated
     convergence_deg: float  # direction of grid north, clockwise from true north [deg]
 
     @property
@@ -70,7 +82,7 @@ def course_of(vehicle: Vehicle, attitude_deg: FloatArray) -> Course | None:
         ]
     )
     level = vehicle.local_frame.level_rotations(motion.position_m[::step])
-    east, north, _ = np.einsum("nji,nj->in", level, chord)
+    east, north, up = np.einsum("nji,nj->in", level, chord)
     base_s = np.minimum(end, since[-1]) - np.maximum(start, 0.0)
     way_m = np.hypot(east, north)
     moves = way_m > _MIN_SPEED_M_S * base_s
@@ -83,14 +95,15 @@ def course_of(vehicle: Vehicle, attitude_deg: FloatArray) -> Course | None:
     return Course(
         time_s=middle[moves],
         course_deg=np.degrees(np.arctan2(east, north))[moves],
+        slope_deg=np.degrees(np.arctan2(up, way_m))[moves],
         attitude_deg=attitude_deg[::step][moves],
         is_straight=(np.abs(turn_deg) < _MAX_TURN_DEG_M * way_m)[moves],
-        sd_heading_deg=0.0 if sds is None else float(np.median(sds[:, 2])),
+        sd_attitude_deg=np.zeros(3) if sds is None else np.median(sds, axis=0),
         convergence_deg=math.degrees(math.atan2(grid_north[0], grid_north[1])),
     )
 
 
-def check_attitude(course: Course | None, settings: VehicleSettings) -> Iterator[Doubt]:
+def check_attitude(course: Course | None) -> Iterator[Doubt]:
     """Compare headings with the course, and roll and pitch with a level road.
 
     If they do not fit, other usual conventions are tried, and those that fit are named.
@@ -98,8 +111,6 @@ def check_attitude(course: Course | None, settings: VehicleSettings) -> Iterator
     if course is not None:
         if course.median_off_deg > _MAX_OFF_DEG:
             yield _wrong_heading(course)
-        else:
-            yield from _check_steady_offset(course, settings)
         yield from _check_level(course)
 
 
@@ -185,52 +196,6 @@ def _wrong_heading(course: Course) -> Doubt:
     )
 
 
-def _check_steady_offset(course: Course, settings: VehicleSettings) -> Iterator[Doubt]:
-    """Yield the doubt about headings that differ from the course alike wherever it is straight.
-
-    They turn the lever arm, and nothing but reference poses would show it.
-    """
-    straight = course.is_straight
-    off = _wrapped(course.attitude_deg[straight, 2] - course.course_deg[straight])
-    part = np.floor(course.time_s[straight] / _PART_S)
-    medians = np.array([np.median(off[part == number]) for number in np.unique(part)])
-    if len(medians) < _MIN_PARTS:
-        return
-    steady = float(np.median(off))
-    sd = float(np.std(medians, ddof=1)) / math.sqrt(len(medians))
-    least = max(
-        _MIN_STEADY_DEG,
-        _MIN_STEADY_SDS * sd,
-        _MIN_STEADY_STATED_SDS * course.sd_heading_deg,
-        float(np.ptp(np.percentile(medians, [5.0, 95.0]))),  # more is not steady
-    )
-    forward, right, _ = settings.lever_arm_m
-    aside_m = math.hypot(forward, right) * math.radians(abs(steady))
-    if abs(steady) < least or aside_m < _MIN_ASIDE_M:
-        return
-    side = "clockwise" if steady > 0.0 else "anticlockwise"
-    yield mild(
-        Cause.HEADING,
-        f"where the vehicle drives straight, headings are {amount(abs(steady), sd)}° {side} of the"
-        f" course: with this lever arm, that displaces the target by {rounded(aside_m)} m",
-        _remedy_of_steady_offset(steady, course.convergence_deg),
-        {"steady_off_deg": steady, "sd_off_deg": sd, "aside_m": aside_m},
-    )
-
-
-def _remedy_of_steady_offset(off_deg: float, convergence_deg: float) -> str:
-    is_by_grid = abs(off_deg + convergence_deg) < _CONVERGENCE_TOLERANCE_DEG
-    if is_by_grid and abs(convergence_deg) > _MIN_CONVERGENCE_DEG:
-        return (
-            "give headings relative to true north: they seem to be relative to grid north; add the"
-            f" meridian convergence, here {minus(f'{convergence_deg:.1f}')}°"
-        )
-    return (
-        "give headings of the axes along which lever_arm_m is measured, relative to true north,"
-        " neither to magnetic nor to grid north, and check crs"
-    )
-
-
 def _check_level(course: Course) -> Iterator[Doubt]:
     roll, pitch = np.median(course.attitude_deg[:, :2], axis=0).tolist()
     if max(abs(roll), abs(pitch)) < _MAX_TILT_DEG:
@@ -251,3 +216,95 @@ def _median_off(heading_deg: FloatArray, course_deg: FloatArray) -> float:
 
 def _wrapped(angle_deg: FloatArray) -> FloatArray:
     return np.asarray((angle_deg + 180.0) % 360.0 - 180.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Angle:
+    """One of the angles, where the vehicle drives straight."""
+
+    code: Cause
+    words: tuple[str, str, str]  # before the offset, and after a positive and a negative one
+    off_deg: FloatArray  # (n,): from what it should be [deg]
+    least_deg: float  # offset that is doubted
+    sd_deg: float  # stated standard deviation; 0: not stated
+    arm_m: float  # length of the lever arm that it turns
+
+
+def check_steady_offsets(course: Course | None, settings: VehicleSettings) -> Iterator[Doubt]:
+    """Yield doubts about angles that are off alike in all straight parts of the drive.
+
+    Headings should be those of the course, pitch the slope of the path, and roll small. Offsets
+    turn the lever arm and displace the target. They arise from headings relative to grid or
+    magnetic north, from the CRS of another zone, or from an instrument that is turned against the
+    axes along which the lever arm is measured. Without reference poses of the camera, nothing else
+    shows them.
+    """
+    if course is None or course.median_off_deg > _MAX_OFF_DEG:
+        return
+    part = np.floor(course.time_s[course.is_straight] / _PART_S)
+    if len(np.unique(part)) < _MIN_PARTS:
+        return
+    for angle in _angles(course, settings):
+        medians = np.array([np.median(angle.off_deg[part == each]) for each in np.unique(part)])
+        off_deg = float(np.median(angle.off_deg))
+        sd_deg = float(np.std(medians, ddof=1)) / math.sqrt(len(medians))
+        spread_deg = float(np.ptp(np.percentile(medians, [5.0, 95.0])))
+        least_deg = max(
+            angle.least_deg, _MIN_SDS * sd_deg, _MIN_STATED_SDS * angle.sd_deg, spread_deg
+        )
+        aside_m = angle.arm_m * math.radians(abs(off_deg))
+        is_doubted = least_deg < abs(off_deg) < _MAX_TILT_DEG and aside_m > _MIN_ASIDE_M
+        if not is_doubted:
+            continue
+        before, positive, negative = angle.words
+        is_heading = angle.code is Cause.HEADING
+        yield mild(
+            angle.code,
+            f"where the vehicle drives straight, {before} {amount(abs(off_deg), sd_deg)}°"
+            f" {positive if off_deg > 0.0 else negative}: with this lever arm, that displaces the"
+            f" target by {rounded(aside_m)} m",
+            _remedy_of_heading(off_deg, course.convergence_deg) if is_heading else _OF_TILT,
+            {"off_deg": off_deg, "sd_off_deg": sd_deg, "aside_m": aside_m},
+        )
+
+
+def _angles(course: Course, settings: VehicleSettings) -> tuple[_Angle, ...]:
+    roll_deg, pitch_deg, heading_deg = course.attitude_deg[course.is_straight].T
+    sd_roll_deg, sd_pitch_deg, sd_heading_deg = course.sd_attitude_deg.tolist()
+    forward_m, right_m, down_m = settings.lever_arm_m
+    return (
+        _Angle(
+            Cause.HEADING,
+            ("headings are", "clockwise of the course", "anticlockwise of the course"),
+            _wrapped(heading_deg - course.course_deg[course.is_straight]),
+            _MIN_HEADING_DEG,
+            sd_heading_deg,
+            math.hypot(forward_m, right_m),
+        ),
+        _Angle(
+            Cause.ATTITUDE,
+            ("pitch is", "above the slope of the path", "below the slope of the path"),
+            pitch_deg - course.slope_deg[course.is_straight],
+            _MIN_PITCH_DEG,
+            sd_pitch_deg,
+            math.hypot(forward_m, down_m),
+        ),
+        _Angle(
+            Cause.ATTITUDE,
+            ("it rolls", "to the right", "to the left"),
+            roll_deg,
+            _MIN_ROLL_DEG,
+            sd_roll_deg,
+            math.hypot(right_m, down_m),
+        ),
+    )
+
+
+def _remedy_of_heading(off_deg: float, convergence_deg: float) -> str:
+    is_by_grid = abs(off_deg + convergence_deg) < _CONVERGENCE_TOLERANCE_DEG
+    if is_by_grid and abs(convergence_deg) > _MIN_CONVERGENCE_DEG:
+        return (
+            "give headings relative to true north: they seem to be relative to grid north; add the"
+            f" meridian convergence, here {minus(f'{convergence_deg:.1f}')}°"
+        )
+    return _OF_HEADING

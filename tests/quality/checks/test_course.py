@@ -9,7 +9,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.target_positions import Vehicle
 from kgcp.georef.trajectory import Trajectory
-from kgcp.quality.checks.course import Course, check_attitude, course_of
+from kgcp.quality.checks.course import Course, check_attitude, check_steady_offsets, course_of
 from kgcp.quality.checks.doubt import Cause
 from kgcp.quality.checks.lever_arm import check_lever_arm, lever_arm_text
 from kgcp.settings import VehicleSettings
@@ -39,15 +39,20 @@ def course_along(
 
 
 def straight_drive(
-    heading_deg: float, *, grid_deg: float = 30.0, stated_deg: float = 0.3
+    heading_deg: float,
+    *,
+    grid_deg: float = 30.0,
+    stated_deg: float = 0.3,
+    roll_deg: float = 0.0,
+    pitch_deg: float = 0.0,
 ) -> Course:
-    """A drive at 10 m/s in one direction of the grid, with noise in positions and headings."""
+    """A drive at 10 m/s up a slope of 3 % in one direction of the grid, with noise."""
     rng = np.random.default_rng(3)
     azimuth = np.radians(grid_deg)
-    way = np.outer(10.0 * TIME_S, [np.sin(azimuth), np.cos(azimuth), 0.0])
+    way = np.outer(10.0 * TIME_S, [np.sin(azimuth), np.cos(azimuth), 0.03])
     position = ORIGIN + way + 0.01 * rng.standard_normal(way.shape)
     heading = heading_deg + 0.3 * rng.standard_normal(len(TIME_S))
-    attitude = np.column_stack((0.0 * heading, 0.0 * heading, heading))
+    attitude = np.column_stack((0.0 * heading + roll_deg, 0.0 * heading + pitch_deg, heading))
     course = course_along(position, attitude, np.full(attitude.shape, stated_deg))
     assert course is not None
     return course
@@ -57,8 +62,8 @@ def test_headings_along_the_course_raise_no_doubt() -> None:
     course = drive()
     assert course is not None
     assert course.median_off_deg == pytest.approx(1.9, abs=0.3)
-    assert not [*check_attitude(course, ARM)]
-    assert not [*check_attitude(drive(lambda heading: heading + 15.0), ARM)]
+    assert not [*check_attitude(course)]
+    assert not [*check_attitude(drive(lambda heading: heading + 15.0))]
 
 
 @pytest.mark.parametrize(
@@ -77,7 +82,7 @@ def test_headings_along_the_course_raise_no_doubt() -> None:
 def test_the_heading_convention_that_fits_is_named(
     turned: Callable[[FloatArray], FloatArray], code: Cause, words: str
 ) -> None:
-    (doubt,) = check_attitude(drive(turned), ARM)
+    (doubt,) = check_attitude(drive(turned))
     assert doubt.is_grave
     assert doubt.code is code
     assert words in doubt.sentence.partition(", or ")[0]
@@ -97,25 +102,44 @@ def test_a_steady_offset_of_headings_is_reported(
     heading_deg: float, stated_deg: float, words: str
 ) -> None:
     course = straight_drive(heading_deg, stated_deg=stated_deg)
-    doubts = [*check_attitude(course, ARM)]
+    doubts = [*check_steady_offsets(course, ARM)]
     assert [doubt.code for doubt in doubts] == [Cause.HEADING] * bool(words)
     for doubt in doubts:
         assert words in doubt.sentence
         assert not doubt.is_grave
         by_grid = "add the meridian convergence, here 1.9°" in doubt.remedy
         assert by_grid == (heading_deg == 30.0)
-    assert not [*check_attitude(course, VehicleSettings(lever_arm_m=(0.0, 0.0, -2.0)))]
+    assert not [*check_steady_offsets(course, VehicleSettings(lever_arm_m=(0.0, 0.0, -2.0)))]
+
+
+@pytest.mark.parametrize(
+    ("roll_deg", "pitch_deg", "words"),
+    [
+        (1.5, 1.7, ""),  # as the road
+        (-3.0, 0.0, ""),  # a road that falls to its edge, and a body that leans
+        (0.0, 4.9, "pitch is 3.1810 ± 0.0026° above the slope of the path"),
+        (0.0, -1.5, "pitch is 3.2190 ± 0.0026° below the slope of the path"),
+        (5.0, 1.7, "it rolls 5° to the right: with this lever arm, that displaces the target by"),
+    ],
+)
+def test_steady_offsets_of_roll_and_pitch_are_reported(
+    roll_deg: float, pitch_deg: float, words: str
+) -> None:
+    course = straight_drive(31.9, roll_deg=roll_deg, pitch_deg=pitch_deg)
+    doubts = [*check_steady_offsets(course, ARM)]
+    assert [doubt.code for doubt in doubts] == [Cause.ATTITUDE] * bool(words)
+    assert all(words in doubt.sentence for doubt in doubts)
 
 
 def test_on_a_straight_line_all_fitting_heading_conventions_are_named() -> None:
     course = straight_drive(heading_deg=270.0, grid_deg=90.0)
-    (doubt,) = check_attitude(course, ARM)
+    (doubt,) = check_attitude(course)
     assert "180° from the course" in doubt.sentence
     assert "anticlockwise from" in doubt.sentence
 
 
 def test_axes_that_point_up_are_reported() -> None:
-    (doubt,) = check_attitude(drive(roll=179.5), ARM)
+    (doubt,) = check_attitude(drive(roll=179.5))
     assert doubt.code is Cause.ATTITUDE
     assert "its z axis points up" in doubt.sentence
 
@@ -126,7 +150,7 @@ def test_a_vehicle_that_stands_has_no_course() -> None:
     standing = Trajectory(TIME_S, position, attitude, None, None)
     frame = LocalFrame.at("EPSG:25832", position[0])
     assert course_of(Vehicle.on(standing, VehicleSettings(), frame), attitude) is None
-    assert not [*check_attitude(None, ARM)]
+    assert not [*check_attitude(None)]
 
 
 def test_lever_arms_are_described_and_implausible_ones_are_doubted() -> None:
