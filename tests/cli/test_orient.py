@@ -94,10 +94,13 @@ def test_a_target_is_placed_as_accurately_as_those_that_orient_the_frames(tmp_pa
     assert summary["doubts"] == []
     for each in summary["targets"]:
         assert abs(each["diameter_m"] - 0.9) < 3.0 * each["sd_diameter_m"] < 4.5e-3
+        # wrong heights tilt all frames alike: more frames do not show the normals better
+        assert each["tilt_deg"] < 3.0 * each["sd_normal_deg"]
+        assert 0.08 < each["sd_normal_deg"] < 0.15
     target = summary["targets"][4]
     off_m = np.array(target["position"]) - flight.positions_map[4]
     assert target["target"] == "E"
-    assert (np.array(target["sd_position_m"])[:2] < 0.015).all()
+    assert (np.array(target["sd_position_m"]) < [0.007, 0.007, 0.02]).all()
     assert (np.abs(off_m) < 3.0 * np.array(target["sd_position_m"])).all()
 
 

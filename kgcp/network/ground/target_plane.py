@@ -19,7 +19,7 @@ import numpy as np
 from scipy import optimize
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
-from kgcp.geometry.attitude import cross_matrix, place_covariances
+from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle_image import (
     circle_derivatives,
@@ -263,38 +263,42 @@ def common_covariance(
     wider[:, 2] = wider[:, 4] = 0.5 * radius
     by_edge = gain @ wider.ravel() * edge_sd_px
     common += np.outer(by_edge, by_edge)
+    by_exterior = _moments_by_exterior(camera, kept, fit.circle)
     if kept.exterior_cov is not None:
-        common += _common_by_orientations(kept.exterior_cov, kept.camera_m, fit.circle)
+        gain_of_frame = gain.reshape(6, -1, 5).transpose(1, 0, 2)
+        common += _common_by_orientations(kept.exterior_cov, by_exterior, gain_of_frame)
     if kept.common_effects is not None:
-        by_exterior = _moments_by_exterior(camera, kept, fit.circle)
         by_errors = gain @ (by_exterior @ kept.common_effects).reshape(-1, 6)
         common += by_errors @ by_errors.T
     return common
 
 
 def _common_by_orientations(
-    exterior_cov: FloatArray, camera_m: FloatArray, circle: SpaceCircle
+    exterior_cov: FloatArray, by_exterior: FloatArray, gain: FloatArray
 ) -> FloatArray:
     """Return the covariance (6, 6) from errors that n orientations share.
 
     How much of their errors is common is unknown, and a block with few control points shifts as a
     whole. If nothing is known of correlations, the projection centres shift with their mean
-    covariance. Otherwise the orientations follow from points on the ground, whose common errors
-    have two effects. The circle shifts, as errors of centre and rotation together displace it, much
-    less than the centres. And with a wrong scale, all distances, and so the diameter, are wrong by
-    the same factor.
+    covariance. Otherwise the orientations follow from points on the ground, whose errors are common
+    to all of them. The covariance of a sum of n effects, however they are correlated, is at most n
+    times the sum of their covariances.
+
+    Parameters
+    ----------
+    exterior_cov : (n, 6, 6) array
+    by_exterior : (n, 5, 6) array
+        Derivatives of the moments by the orientations.
+    gain : (n, 6, 5) array
+        Derivatives of the circle's unknowns by the moments.
     """
-    common = np.zeros((6, 6))
-    position_cov = exterior_cov[:, :3, :3]
     if not exterior_cov[:, :3, 3:].any():
-        common[:3, :3] = position_cov.mean(axis=0)
+        common = np.zeros((6, 6))
+        common[:3, :3] = exterior_cov[:, :3, :3].mean(axis=0)
         return common
-    sight_m = circle.centre_m - camera_m
-    common[:3, :3] = place_covariances(exterior_cov, sight_m).mean(axis=0)
-    along_m4 = np.einsum("ni,nij,nj->n", sight_m, position_cov, sight_m)
-    scale_variance = float(np.mean(along_m4 / np.sum(sight_m**2, axis=1) ** 2))
-    common[5, 5] = scale_variance * circle.radius_m**2
-    return common
+    effects = gain @ by_exterior
+    each = effects @ exterior_cov @ np.swapaxes(effects, 1, 2)
+    return np.asarray(len(each) * each.sum(axis=0))
 
 
 def _fit(
