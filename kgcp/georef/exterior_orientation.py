@@ -55,6 +55,11 @@ class ExteriorOrientations:
             states_angles=poses.cov is not None or poses.sd_angle_deg is not None,
         )
 
+    @property
+    def has_correlations(self) -> bool:
+        """Whether `cov` has the covariances of position and rotation, as poses by points have."""
+        return self.cov is not None and bool(self.cov[:, :3, 3:].any())
+
     def place_covariances(self, rows: Sequence[int], sight_m: FloatArray) -> FloatArray:
         """Return the covariances (n, 3, 3) that the orientations give to places in sight [m²].
 

@@ -126,7 +126,7 @@ def _adjust(
     trajectory were far better, or far worse, than it is.
     """
     columns = np.concatenate(
-        (equations.design, equations.offset[:, :, None], equations.common[:, :, None]), axis=2
+        (equations.design, equations.offset[:, :, None], equations.common), axis=2
     )[kept]
     correlated = equations.correlated + _REGULARISATION_M2 * np.eye(3)
     errors = ErrorModel(equations.independent, correlated, time_s).kept(kept)

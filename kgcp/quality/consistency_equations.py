@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.attitude import cross_matrix
+from kgcp.geometry.attitude import cross_matrix, place_covariances
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.georef.exterior_orientation import ExteriorOrientations
@@ -45,8 +45,8 @@ class ConsistencyEquations:
     correlated: FloatArray  # (n, 3, 3): covariance by the trajectory, correlated over time [m²]
     # (n, 3, 3): covariance by all errors that are independent from frame to frame [m²]
     independent: FloatArray
-    # (n, 3): change of the offset by one standard deviation of calibration and diameter, which
-    # change the distance [m]
+    # (n, 3, k): change of the offset by one standard deviation of errors that all frames share [m]:
+    # of calibration and diameter, which change the distance, and of the reference poses
     common: FloatArray
     has_sds: bool  # whether trajectory and reference poses have standard deviations
     track: FloatArray  # (n, 3, 3): along the track, across it to the right and up, as rows
@@ -98,6 +98,10 @@ class ConsistencyEquations:
         )
         common_m = np.array([frame.sighting.sd_common_distance_m or 0.0 for frame in frames])
         unit = sight / np.linalg.norm(sight, axis=1, keepdims=True)
+        common = [(unit * common_m[:, None])[:, :, None]]
+        if orientations.has_correlations:
+            weights = 1.0 / np.trace(correlated + independent, axis1=1, axis2=2)
+            common.append(_common_by_poses(orientations, rows, sight, weights))
         stated = (
             all(frame.position.cov_m2 is not None for frame in frames)
             and orientations.cov_m2 is not None
@@ -107,7 +111,7 @@ class ConsistencyEquations:
             design,
             correlated,
             independent,
-            unit * common_m[:, None],
+            np.concatenate(common, axis=2),
             stated,
             _track(velocity, body),
         )
@@ -141,6 +145,50 @@ def _independent_m2(
     if orientations.cov_m2 is None:
         total = total + _UNSTATED_SD_M**2 * np.eye(3)
     return np.asarray(total)
+
+
+def _common_by_poses(
+    orientations: ExteriorOrientations, rows: Sequence[int], sight: FloatArray, weights: FloatArray
+) -> FloatArray:
+    """Return the effects (n, 3, 7) of errors that all poses share, by one standard deviation [m].
+
+    Such poses mostly follow from a few points on the ground. Wrong points shift, turn and scale all
+    that is seen, the cameras included: about a point O, a place moves by δ + ω × (P − O), and,
+    since its distance from the camera C is measured, by s (C − O). How much of the poses' errors is
+    common is unknown; therefore all of it is counted.
+
+    Parameters
+    ----------
+    weights : (n,) array
+        How much each frame counts in the comparison.
+    """
+    if orientations.cov is None:
+        return np.zeros((len(sight), 3, 0))
+    cov = orientations.cov[[*rows]]
+    length = np.linalg.norm(sight, axis=1)
+    unit = sight / length[:, None]
+    across = np.eye(3) - unit[:, :, None] * unit[:, None, :]
+    shift = _mean_root(across @ place_covariances(cov, sight) @ across, weights)
+    turn = _mean_root(cov[:, 3:, 3:], weights)
+    along = np.einsum("ni,nij,nj->n", unit, cov[:, :3, :3], unit) / length**2
+    scale = np.sqrt(np.average(along, weights=weights))
+    camera = orientations.centre_m[[*rows]]
+    place = camera + sight
+    middle = place.mean(axis=0)
+    return np.concatenate(
+        (
+            np.broadcast_to(shift, (len(sight), 3, 3)),
+            -cross_matrix(place - middle) @ turn,
+            scale * (camera - middle)[:, :, None],
+        ),
+        axis=2,
+    )
+
+
+def _mean_root(covs: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return L with L Lᵀ = the mean of covariances (n, 3, 3)."""
+    values, vectors = np.linalg.eigh(np.average(covs, axis=0, weights=weights))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _camera_velocity(

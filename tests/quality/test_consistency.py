@@ -239,6 +239,31 @@ def test_only_injected_errors_are_found_within_their_deviations(name: str) -> No
         assert one.estimate.chi2_before - one.estimate.chi2_after > 60.0
 
 
+def _poses_by_points(poses: ReferencePoses, sd_up_m: float) -> ReferencePoses:
+    """State that poses err by their own turns about places 60 m below them, and in height."""
+    turn = math.radians(_SD_REFERENCE_DEG)
+    effects = np.zeros((6, 9))
+    effects[:3, :3] = np.diag(
+        [_SD_REFERENCE_M, _SD_REFERENCE_M, math.hypot(_SD_REFERENCE_M, sd_up_m)]
+    )
+    effects[:3, 3:6] = turn * np.array([[0.0, 60.0, 0.0], [-60.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    effects[3:, 3:6] = turn * np.eye(3)
+    cov = np.broadcast_to(effects @ effects.T, (len(poses.frames), 6, 6))
+    return replace(poses, cov=cov)
+
+
+def test_errors_that_all_poses_share_are_no_corrections() -> None:
+    """Poses by targets on the ground are all too high by the same amount."""
+    sightings, positions, poses = Flight(frames=60).inputs()
+    high = replace(poses, position_map=poses.position_map + np.array([0.0, 0.0, 0.03]))
+    found = study_consistency(sightings, positions, _poses_by_points(high, 0.03), _CAMERA)
+    assert found is not None
+    assert corrections(found) == ()
+    by_name = {one.name: one for one in found.estimate.corrections}
+    assert by_name["lever_arm_down_m"].value == pytest.approx(-0.03, abs=0.01)
+    assert by_name["lever_arm_down_m"].sd == pytest.approx(0.03, abs=0.01)
+
+
 def test_scatter_over_flights_is_the_reported_sigma() -> None:
     flight = Flight(time_offset_s=0.025, lever_m=_LEVER + _TO_THE_RIGHT, readout_s=0.03)
     truth = np.array([0.025, 0.0, 0.08, 0.0, 0.03, *[0.0] * 3])
