@@ -88,8 +88,8 @@ def _covariances(columns: CsvColumns) -> FloatArray | None:
     if is_wrong.any():
         line = columns.lines[int(np.argmax(is_wrong))]
         raise KgcpError(
-            f"{columns.path}, line {line}: {_COVARIANCE_WORDS} are no covariance; correct them, or"
-            " delete these columns"
+            f"{columns.path}, line {line}: {_COVARIANCE_WORDS} are no covariance; if a"
+            " spreadsheet has rounded them, take the file as it was written"
         )
     return cov
 
@@ -105,6 +105,6 @@ def _require_agreement(
         row, column = wrong[0].tolist()
         raise KgcpError(
             f"{columns.path}, line {columns.lines[row]}: {names[column]} is {sds[row, column]:g},"
-            f" but {by_cov[row, column]:g} by {_COVARIANCE_WORDS}; delete those columns, or make"
-            " both agree"
+            f" but {by_cov[row, column]:g} by {_COVARIANCE_WORDS}; make both agree, or, if a"
+            " spreadsheet has rounded them, take the file as it was written"
         )

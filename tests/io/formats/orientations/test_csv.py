@@ -114,7 +114,8 @@ def test_covariances_follow_the_axes_into_other_coordinates(tmp_path: Path) -> N
         ({"sd_x": "0.1"}, "line 2: sd_x is 0.1, but 0.0316228 by cov_x_x to cov_rot_z_rot_z"),
         ({"sd_angle_deg": "0"}, "line 2: sd_angle_deg is 0, but 0.0572958 by cov_x_x"),
         ({"cov_x_rot_y": "-0.1"}, "line 2: cov_x_x to cov_rot_z_rot_z are no covariance"),
-        ({"cov_x_x": "-1e-3"}, "line 2: cov_x_x to cov_rot_z_rot_z are no covariance"),
+        ({"cov_x_x": "-1e-3"}, "line 2: cov_x_x to cov_rot_z_rot_z are no covariance; if a spread"),
+        ({"sd_x": "0.03", "cov_x_x": "0.0010"}, "line 2: .* if a spreadsheet has rounded them"),
     ],
 )
 def test_a_contradictory_covariance_is_refused(
