@@ -17,7 +17,12 @@ from kgcp.georef.sighting import Sighting, unmistakable
 from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.quality.consistency_equations import ComparedFrame, ConsistencyEquations
 from kgcp.quality.corrections import UNKNOWN_LIMITS, CorrectionEstimate, estimate_corrections
-from kgcp.quality.robust_gls import ErrorModel, find_outliers, whitened_products
+from kgcp.quality.robust_gls import (
+    ErrorModel,
+    find_outliers,
+    whitened_products,
+    with_shared_errors,
+)
 from kgcp.settings import VehicleSettings
 
 MIN_FRAMES = 10
@@ -126,13 +131,21 @@ def _adjust(
     trajectory were far better, or far worse, than it is.
     """
     columns = np.concatenate(
-        (equations.design, equations.offset[:, :, None], equations.common), axis=2
+        (
+            equations.design,
+            equations.offset[:, :, None],
+            equations.common[:, :, None],
+            equations.shared,
+        ),
+        axis=2,
     )[kept]
     correlated = equations.correlated + _REGULARISATION_M2 * np.eye(3)
     errors = ErrorModel(equations.independent, correlated, time_s).kept(kept)
     trials = []
     for correlation_s in _CORRELATION_TIMES_S:
-        products, log_det = whitened_products(columns, errors, correlation_s)
+        products, log_det = with_shared_errors(
+            *whitened_products(columns, errors, correlation_s), equations.shared.shape[2]
+        )
         fitted = estimate_corrections(products, 3 * len(columns), has_sds=equations.has_sds)
         misfit = fitted.chi2_after
         if not equations.has_sds:  # likelihood with the likeliest scale of all variances

@@ -45,9 +45,12 @@ class ConsistencyEquations:
     correlated: FloatArray  # (n, 3, 3): covariance by the trajectory, correlated over time [m²]
     # (n, 3, 3): covariance by all errors that are independent from frame to frame [m²]
     independent: FloatArray
-    # (n, 3, k): change of the offset by one standard deviation of errors that all frames share [m]:
-    # of calibration and diameter, which change the distance, and of the reference poses
+    # (n, 3): change of the offset by one standard deviation of calibration and diameter, which
+    # change the distance [m]
     common: FloatArray
+    # (n, 3, k): change of the offset by one standard deviation of errors of the reference poses
+    # that all frames share [m]
+    shared: FloatArray
     has_sds: bool  # whether trajectory and reference poses have standard deviations
     track: FloatArray  # (n, 3, 3): along the track, across it to the right and up, as rows
 
@@ -98,10 +101,7 @@ class ConsistencyEquations:
         )
         common_m = np.array([frame.sighting.sd_common_distance_m or 0.0 for frame in frames])
         unit = sight / np.linalg.norm(sight, axis=1, keepdims=True)
-        common = [(unit * common_m[:, None])[:, :, None]]
-        if orientations.has_correlations:
-            weights = 1.0 / np.trace(correlated + independent, axis1=1, axis2=2)
-            common.append(_common_by_poses(orientations, rows, sight, weights))
+        weights = 1.0 / np.trace(correlated + independent, axis1=1, axis2=2)
         stated = (
             all(frame.position.cov_m2 is not None for frame in frames)
             and orientations.cov_m2 is not None
@@ -111,7 +111,8 @@ class ConsistencyEquations:
             design,
             correlated,
             independent,
-            np.concatenate(common, axis=2),
+            unit * common_m[:, None],
+            _shared_by_poses(orientations, rows, sight, weights),
             stated,
             _track(velocity, body),
         )
@@ -147,10 +148,10 @@ def _independent_m2(
     return np.asarray(total)
 
 
-def _common_by_poses(
+def _shared_by_poses(
     orientations: ExteriorOrientations, rows: Sequence[int], sight: FloatArray, weights: FloatArray
 ) -> FloatArray:
-    """Return the effects (n, 3, 7) of errors that all poses share, by one standard deviation [m].
+    """Return the effects (n, 3, k) of errors that all poses share, by one standard deviation [m].
 
     Such poses mostly follow from a few points on the ground. Wrong points shift, turn and scale all
     that is seen, the cameras included: about a point O, a place moves by δ + ω × (P − O), and,
@@ -162,7 +163,7 @@ def _common_by_poses(
     weights : (n,) array
         How much each frame counts in the comparison.
     """
-    if orientations.cov is None:
+    if orientations.cov is None or not orientations.has_correlations:
         return np.zeros((len(sight), 3, 0))
     cov = orientations.cov[[*rows]]
     length = np.linalg.norm(sight, axis=1)

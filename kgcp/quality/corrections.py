@@ -92,9 +92,10 @@ def estimate_corrections(products: FloatArray, count: int, *, has_sds: bool) -> 
 
     Parameters
     ----------
-    products : (11 + k, 11 + k) array
-        Weighted products of columns: those of the 10 unknowns, the discrepancy that they are to
-        cancel, and the effects of one standard deviation of k errors that all frames share.
+    products : (12, 12) array
+        Weighted products of twelve columns: those of the 10 unknowns, the discrepancy that they
+        are to cancel, and the effect of one standard deviation of calibration and diameter, an
+        error that all frames share.
     count : int
         Number of coordinates compared, three per frame.
     has_sds : bool
@@ -118,10 +119,7 @@ def _estimate(
     products: FloatArray, count: int, wanted: Sequence[Unknown], *, has_sds: bool
 ) -> CorrectionEstimate:
     """Estimate those corrections that are wanted and determined."""
-    count_all = len(UNKNOWNS)
-    by_unknowns = products[:count_all]
-    normal, observed = by_unknowns[:, :count_all], by_unknowns[:, count_all]
-    common = by_unknowns[:, count_all + 1 :]
+    normal, observed, common = products[:-2, :-2], products[:-2, -2], products[:-2, -1]
     is_determined = np.diag(normal) * UNKNOWN_LIMITS**2 > 1.0
     determined = [i for i, each in enumerate(UNKNOWNS) if each in wanted and is_determined[i]]
     active, groups = separable_unknowns(normal, determined, _MAX_INFLATIONS)
@@ -129,13 +127,13 @@ def _estimate(
     values = np.zeros(len(UNKNOWNS))
     values[active] = -inverse @ observed[active]
     freedom = count - len(active)
-    before = float(products[count_all, count_all])
+    before = float(products[-2, -2])
     after = max(before + float(values @ observed), np.finfo(float).tiny)  # not below 0 by rounding
     factor = after / freedom
     cov = (max(1.0, factor) if has_sds else factor) * inverse
     shift = inverse @ common[active]
     sds = np.full(len(UNKNOWNS), np.nan)
-    sds[active] = np.sqrt(np.diag(cov) + np.sum(shift**2, axis=1))
+    sds[active] = np.sqrt(np.diag(cov) + shift**2)
     corrections = tuple(
         _correction(index, float(values[index]), float(sds[index]), freedom, groups)
         for index in range(len(UNKNOWNS))

@@ -232,6 +232,25 @@ def whitened_products(
     return np.asarray(products), float(log_det)
 
 
+def with_shared_errors(
+    products: FloatArray, log_det: float, count: int
+) -> tuple[FloatArray, float]:
+    """Return products and log det as `whitened_products` with errors that all observations share.
+
+    With their effects S by one standard deviation, the covariance is Σ + S Sᵀ.
+
+    Parameters
+    ----------
+    products : (k, k) array
+        The last `count` of the k columns are S; they are left out of the result.
+    """
+    others = len(products) - count
+    inner = np.eye(count) + products[others:, others:]
+    by_shared = products[:others, others:]
+    reduced = products[:others, :others] - by_shared @ np.linalg.solve(inner, by_shared.T)
+    return np.asarray(reduced), log_det + float(np.linalg.slogdet(inner)[1])
+
+
 def _as_matrices(variances: FloatArray) -> FloatArray:
     """Return variances as (n, d, d)."""
     return variances[:, None, None] if variances.ndim == 1 else variances

@@ -14,6 +14,7 @@ from kgcp.quality.robust_gls import (
     separable_unknowns,
     two_sided_probability,
     whitened_products,
+    with_shared_errors,
 )
 from kgcp.quality.statistics import fit_slope
 
@@ -150,3 +151,16 @@ def test_holm_and_student_agree_with_published_tables() -> None:
     assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
     assert two_sided_probability(2.228, 10) == pytest.approx(0.05, abs=1e-4)
     assert two_sided_probability(-3.169, 10) == pytest.approx(0.01, abs=1e-4)
+
+
+def test_shared_errors_are_part_of_the_covariance() -> None:
+    rng = np.random.default_rng(4)
+    columns, shared = rng.standard_normal((6, 3, 4)), rng.standard_normal((6, 3, 2))
+    same = np.broadcast_to(np.eye(3), (6, 3, 3))
+    errors = ErrorModel(0.5 * same, 0.2 * same, np.arange(6.0))
+    both = np.concatenate((columns, shared), axis=2)
+    found, log_det = with_shared_errors(*whitened_products(both, errors, 0.0), 2)
+    cov = 0.7 * np.eye(18) + shared.reshape(18, 2) @ shared.reshape(18, 2).T
+    flat = columns.reshape(18, 4)
+    np.testing.assert_allclose(found, flat.T @ np.linalg.solve(cov, flat), rtol=1e-9, atol=1e-12)
+    assert log_det == pytest.approx(np.linalg.slogdet(cov)[1])
