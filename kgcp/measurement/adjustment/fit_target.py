@@ -21,7 +21,7 @@ from kgcp.measurement.adjustment.acceptance import check_code, check_fit, check_
 from kgcp.measurement.adjustment.appearance import appearance_of, imaging_of
 from kgcp.measurement.adjustment.covariance import ambiguity_cov, pose_covariance, propagate
 from kgcp.measurement.adjustment.extensions import (
-    UnevenLightInBins,
+    BinsAreTooCoarse,
     fit_in_any_light,
     with_untried_base,
 )
@@ -105,7 +105,7 @@ def measure_by_model(
     blur = _start_blur(start.blur_px, outlined_px, problem.window.binning)
     try:
         fits = fit_in_any_light(problem, pose, blur, prior.tone_base)
-    except UnevenLightInBins:
+    except BinsAreTooCoarse:
         finer = finer_problem_of(grey, camera, target, pose, prior.rotation)
         problem = replace(finer, visible=visible)
         blur = _start_blur(start.blur_px, outlined_px, problem.window.binning)

@@ -51,7 +51,8 @@ class FitProblem:
     # everywhere, as far as the search knows
     visible: BoolArray | None = None
     most_pixels: int | None = None  # that are adjusted; None: all that are useful
-    # whether to raise `UnevenLightInBins` if the light on bins is uneven
+    # whether to raise `BinsAreTooCoarse` if the light on bins is uneven or they show the profile of
+    # edges
     may_be_finer: bool = False
     # grey value that burnt white has below the end of the range; None: it is seen clipped
     burnt_white: float | None = None
