@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -466,6 +467,26 @@ def resting_at(pose: Pose) -> Callable[..., TargetFit]:
         return replace(best, parameters=best.parameters.at(pose))
 
     return fit
+
+
+def test_a_fit_with_a_shadow_that_no_pixel_sees_gives_way_to_the_next(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its equations were singular: the covariance was not finite, and numpy raised LinAlgError."""
+
+    def fit(offset_precision: float) -> Any:  # noqa: ANN401 - only what matters of a fit
+        field = SimpleNamespace(shadows=SimpleNamespace(rows=np.zeros((1, 5))))
+        normal = np.diag((9.0, 9.0, 4.0, offset_precision, 1.0, 4.0, 4.0))
+        return SimpleNamespace(
+            parameters=SimpleNamespace(field=field), level_equations=SimpleNamespace(normal=normal)
+        )
+
+    unseen, seen = fit(3e-17), fit(5.0)
+    monkeypatch.setattr(random_levels, "_adjust_levels", lambda _, start, __: start)
+    nothing: Any = None
+    assert random_levels.fit_levels(nothing, [unseen, seen], nothing) is seen
+    with pytest.raises(Rejection, match="seen by no pixel"):
+        random_levels.fit_levels(nothing, [unseen], nothing)
 
 
 def test_centres_with_a_comatic_lens_are_as_accurate_as_stated(

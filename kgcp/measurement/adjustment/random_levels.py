@@ -13,7 +13,7 @@ from typing import cast
 
 import numpy as np
 
-from kgcp.errors import Rejection
+from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.covariance import pose_covariance
@@ -56,7 +56,7 @@ from kgcp.measurement.image_model.photometry import (
     light_after_step,
     plateau_levels,
 )
-from kgcp.measurement.image_model.shadow_edges import NO_EDGES
+from kgcp.measurement.image_model.shadow_edges import ANGLE, EDGE_PRECISION, NO_EDGES, OFFSET
 
 # Tuning of the levels, by the light flights of `benchmarks.accuracy.evaluate`. The number of phases
 # is enough: three more phases move the distance by 0.05 σ or less in dirt, under highlights and in
@@ -88,6 +88,9 @@ _PLATEAU_PIXELS = 1200
 # band their errors under highlights grew.
 _NEAR_SIGMAS, _NEAR_FROM_PX = 3.3, 4.0 * _FINEST_PX
 _LEAST_CONTRAST = 0.05
+# Precision of an edge's direction [1/rad²] and offset [1/px²] below which no pixel sees it. Edges
+# that are seen have more than 1.
+_LEAST_EDGE_PRECISION = 1e-6
 # The excess is the mean square of the residuals' sums over cells, relative to that of independent
 # residuals. If it is larger than this, the levels vary; in even light it is about 1. Bins have
 # little noise and a limit of their own: of rings of R 150 to 310 px, 19 in even light had 0.9 to
@@ -169,8 +172,27 @@ def fit_levels(problem: FitProblem, starts: list[Parameters], unknowns: Unknowns
     """
     for start in starts[:-1]:
         with contextlib.suppress(Rejection):
-            return _adjust_levels(problem, start, unknowns)
-    return _adjust_levels(problem, starts[-1], unknowns)
+            return _with_all_edges(_adjust_levels(problem, start, unknowns))
+    return _with_all_edges(_adjust_levels(problem, starts[-1], unknowns))
+
+
+def _with_all_edges(fit: TargetFit) -> TargetFit:
+    """Return a fit whose pixels see all of its shadows' edges.
+
+    An edge that has left the pixels has no direction and no place. Its equations are singular, but
+    for rounding, and the covariance cannot be computed.
+
+    Raises
+    ------
+    Rejection
+        `POOR_FIT` if an edge has left them.
+    """
+    count = _field_of(fit.parameters).shadows.rows.size
+    equations = np.diag(_equations_of(fit).normal)
+    of_edges = equations[len(equations) - count :].reshape(-1, len(EDGE_PRECISION))
+    if np.any(of_edges[:, [ANGLE, OFFSET]] < _LEAST_EDGE_PRECISION):
+        raise Rejection(Reason.POOR_FIT, "the edge of a shadow is seen by no pixel")
+    return fit
 
 
 def fit_other_pose(first: TargetFit, other: Pose) -> tuple[TargetFit, TargetFit]:
