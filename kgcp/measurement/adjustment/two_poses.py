@@ -133,10 +133,14 @@ def advantage(poses: TwoPoses, covariance: PoseCovariance, prior: NormalPrior | 
     """Return the Δχ² by which the other pose is worse: that of the image plus that of the prior.
 
     The Δχ² of the image is divided by the inflation of the covariance, since correlated residuals
-    count less. Both normals are taken to have the covariance of the better pose.
+    count less. Where levels vary, it is divided by it once more: what they leave is correlated over
+    whole edges, as the difference of both poses is. Both normals are taken to have the covariance
+    of the better pose.
     """
     best, other = poses.best, poses.other
     of_image = 2.0 * (other.total - best.total) / covariance.inflation
+    if best.level_equations is not None:
+        of_image /= covariance.inflation
     if prior is None:
         return of_image
     rotation_cov = covariance.pose_cov[3:, 3:]

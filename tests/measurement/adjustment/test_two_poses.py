@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +14,9 @@ from scipy.spatial.transform import Rotation
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.covariance import PoseCovariance
 from kgcp.measurement.adjustment.fit_target import measure_by_model
+from kgcp.measurement.adjustment.two_poses import TwoPoses, advantage
 from kgcp.measurement.records import InitialPose, Measurement
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Sensor, ToneCurve
@@ -62,3 +66,13 @@ def test_from_straight_above_the_distance_is_found(
     start = start_near(LENS, above, np.random.default_rng(seed))
     seen = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
     check_distance(seen, pose)
+
+
+@pytest.mark.parametrize(("levels", "expected"), [(None, 10.0), (object(), 4.0)])
+def test_residuals_that_levels_leave_count_twice_against_the_choice_of_a_pose(
+    levels: object, expected: float
+) -> None:
+    best: Any = SimpleNamespace(total=100.0, level_equations=levels)
+    other: Any = SimpleNamespace(total=112.5, level_equations=levels)
+    covariance = PoseCovariance(np.eye(6), inflation=2.5)
+    assert advantage(TwoPoses(best, other), covariance, None) == pytest.approx(expected)
