@@ -25,8 +25,9 @@ _RATIO_TOLERANCE = 0.2  # relative
 _MIN_ALTITUDE_M = 3.0  # above take-off, of frames that are compared
 _MIN_SIGHTINGS = 5
 # By how much the camera's horizontal distance from the vehicle may be wrong: by the drone's
-# receiver, and, as a share of the measured distance, by the plate's normal and the road's slope.
-_RECEIVER_M, _NORMAL_SHARE = 10.0, 0.2
+# receiver, whose position may also be old, and, as a share of the measured distance, by the plate's
+# normal and the road's slope.
+_RECEIVER_M, _MAX_AGE_S, _NORMAL_SHARE = 10.0, 1.0, 0.2
 _MIN_COVERED_SHARE = 0.6  # of the sightings, that must be within the trajectory after a shift
 _SCAN_S, _SCAN_STEP_S = 120.0, 0.5  # of shifts of the clock that are not usual ones
 _DAY_S = 86_400.0  # whole days are slips of dates, which no offset corrects
@@ -211,6 +212,8 @@ class _CamerasBeside:
         times_s, distances_m, poses, cameras_deg = zip(*seen, strict=True)
         origin_deg = track_deg[0]
         distance_m = np.array(distances_m)
+        steps_m = np.linalg.norm(np.diff(vehicle.motion.position_m, axis=0), axis=1)
+        speed_m_s = float(steps_m.sum() / np.ptp(vehicle.motion.time_s))
         # the same for both poses of a circle, whose normals are mirrored about the viewing ray
         above_m = np.array([pose.normal @ pose.translation_m for pose in poses])
         return cls(
@@ -218,7 +221,7 @@ class _CamerasBeside:
             time_s=np.array(times_s) + vehicle.settings.time_offset_s,
             camera_m=_metres(np.array(cameras_deg) - origin_deg, origin_deg),
             measured_m=np.sqrt(np.maximum(distance_m**2 - above_m**2, 0.0)),
-            tolerance_m=_RECEIVER_M + _NORMAL_SHARE * distance_m,
+            tolerance_m=_RECEIVER_M + _MAX_AGE_S * speed_m_s + _NORMAL_SHARE * distance_m,
             epoch_s=vehicle.motion.time_s[::step],
             vehicle_m=_metres(track_deg - origin_deg, origin_deg),
         )
