@@ -188,7 +188,7 @@ def report(
 ) -> None:
     """Print the counts of the run; with `as_json` also to stdout, and the doubts about the flight.
 
-    stderr has the doubts besides.
+    The caller prints the doubts to stderr.
     """
     frames_per_s = (summary.frames - summary.kept) / seconds
     numbers = {**summary.numbers(), "seconds": seconds, "frames_per_s": frames_per_s}

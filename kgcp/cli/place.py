@@ -116,12 +116,13 @@ def command(
 
         files = [*map(workspace.named, written)]
         click.echo(json.dumps({**places.summary(), "files": files, "not_renewed": older}))
+    doubts = places.doubts
     for sentence in places.sentences:
-        if sentence not in places.doubts:
+        if sentence not in doubts:
             click.echo(sentence, err=True)
     for name, reason in places.placement.skipped.items():
         click.echo(f"not placed: {name}: {reason}", err=True)
-    for doubt in places.doubts:
+    for doubt in doubts:
         click.echo(f"kgcp: doubt: {doubt}", err=True)
     for path in written:
         click.echo(f"wrote {workspace.named(path)}", err=True)

@@ -67,20 +67,20 @@ def turned_covariance(axes: FloatArray, cov: FloatArray) -> FloatArray:
 
 
 def place_covariances(pose_cov: FloatArray, sight: FloatArray) -> FloatArray:
-    """Return the covariances (n, 3, 3) that poses give to places in sight.
+    """Return the covariances (..., 3, 3) that poses give to places in sight.
 
     With R' = exp(ω) R and C' = C + δ, a place C + s moves by δ + ω × s.
 
     Parameters
     ----------
-    pose_cov : (n, 6, 6) array
+    pose_cov : (..., 6, 6) array
         Of projection centre and left rotation vector [rad].
-    sight : (n, 3) array
+    sight : (..., 3) array
         From the projection centres to the places, in the same axes and unit.
     """
-    identity = np.broadcast_to(np.eye(3), (len(sight), 3, 3))
-    by_error = np.concatenate((identity, -cross_matrix(sight)), axis=2)
-    return np.asarray(by_error @ pose_cov @ np.swapaxes(by_error, 1, 2))
+    identity = np.broadcast_to(np.eye(3), (*sight.shape, 3))
+    by_error = np.concatenate((identity, -cross_matrix(sight)), axis=-1)
+    return np.asarray(by_error @ pose_cov @ np.swapaxes(by_error, -1, -2))
 
 
 def down_in_camera(opk_deg: FloatArray) -> FloatArray:

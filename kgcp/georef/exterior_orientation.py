@@ -31,12 +31,11 @@ class ExteriorOrientations:
     centre_m: FloatArray  # (n, 3): projection centres in the ENU frame [m]
     # (n, 3, 3): camera axes (x right, y down, z forward) in the ENU frame, as columns
     enu_from_camera: FloatArray
-    # (n, 3, 3): covariances of the centres in ENU axes [m²]; None: the poses do not state them
-    cov_m2: FloatArray | None
     # (n, 6, 6): covariances of the centres [m] and of left rotation vectors [rad], ENU axes; what
     # the poses do not state counts as exact; None: they state nothing
     cov: FloatArray | None
-    states_angles: bool  # whether `cov` has the accuracy of the attitudes
+    states_centres: bool  # whether `cov` has the accuracy of the centres
+    states_angles: bool  # and that of the attitudes
 
     @classmethod
     def of(cls, poses: ReferencePoses, local_frame: LocalFrame) -> Self:
@@ -45,15 +44,23 @@ class ExteriorOrientations:
         enu_from_map = local_frame.grid_rotation(centre)
         # CAMERA_FROM_PHOTO = diag(1, -1, -1) is its own inverse
         enu_from_camera = enu_from_map @ rotation_from_opk(poses.opk_deg) @ CAMERA_FROM_PHOTO
-        cov = _stated_covariance(poses, enu_from_map)
-        states_centres = poses.cov is not None or poses.sd_position_m is not None
         return cls(
             centre,
             enu_from_camera,
-            cov_m2=cov[:, :3, :3] if cov is not None and states_centres else None,
-            cov=cov,
+            cov=_stated_covariance(poses, enu_from_map),
+            states_centres=poses.cov is not None or poses.sd_position_m is not None,
             states_angles=poses.cov is not None or poses.sd_angle_deg is not None,
         )
+
+    @property
+    def cov_m2(self) -> FloatArray | None:
+        """Covariances (n, 3, 3) of the centres in ENU axes [m²]; None: not stated."""
+        return None if self.cov is None or not self.states_centres else self.cov[:, :3, :3]
+
+    @property
+    def states_all(self) -> bool:
+        """Whether `cov` has the accuracy of centres and attitudes."""
+        return self.states_centres and self.states_angles
 
     @property
     def has_correlations(self) -> bool:

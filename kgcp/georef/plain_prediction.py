@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.attitude import ReferencePoses, cross_matrix
+from kgcp.geometry.attitude import ReferencePoses, place_covariances
 from kgcp.geometry.camera import Camera
 from kgcp.georef.exterior_orientation import ExteriorOrientations, visible_pixel
 from kgcp.georef.local_frame import LocalFrame
@@ -66,9 +66,9 @@ def reference_orientations(
     """Return reference poses by frame."""
     orientations = ExteriorOrientations.of(poses, local_frame)
     by_frame = {}
-    states_all = orientations.cov_m2 is not None and orientations.states_angles
+    covs = orientations.cov if orientations.states_all else None
     for row, frame in enumerate(poses.frames):
-        cov = orientations.cov[row] if orientations.cov is not None and states_all else None
+        cov = None if covs is None else covs[row]
         by_frame[frame] = FrameOrientation(
             orientations.centre_m[row], orientations.enu_from_camera[row], cov, "the reference"
         )
@@ -110,9 +110,7 @@ def _predicted(
     min_sd_px, min_sd_log = _UNSTATED_SD_PX, _UNSTATED_SD_LOG
     if orientation.cov is not None:
         min_sd_px, min_sd_log = _MIN_SD_PX, _MIN_SD_LOG
-        # p = Rᵀ (X − C): errors δC and a left rotation α displace it by Rᵀ (−δC + (X − C) × α)
-        by_pose = np.hstack((-np.eye(3), cross_matrix(from_centre_m)))
-        cov_m2 = cov_m2 + by_pose @ orientation.cov @ by_pose.T
+        cov_m2 = cov_m2 + place_covariances(orientation.cov, from_centre_m)
     cov_m2 = camera_from_enu @ cov_m2 @ camera_from_enu.T
     distance_m = float(np.linalg.norm(sight_m))
     ray, by_position = sight_m / distance_m, _pixel_by_position(camera, sight_m)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -76,6 +76,11 @@ def _is_pair(value: object) -> bool:
     return len(value) == _PAIR and all(isinstance(name, str) for name in value)
 
 
+def is_excluded(frame: str, target: str, excluded: Collection[tuple[str, str]]) -> bool:
+    """Tell whether pairs as in `Selection.excluded` exclude a target in a frame."""
+    return (frame, "") in excluded or (frame, target) in excluded
+
+
 def exclude(
     sightings: Sequence[Sighting], excluded: Sequence[tuple[str, str]]
 ) -> tuple[list[Sighting], tuple[SkippedSighting, ...]]:
@@ -89,10 +94,10 @@ def exclude(
     unwanted = set(excluded)
     kept, skipped = [], []
     for sighting in sightings:
-        if unwanted.isdisjoint({(sighting.frame, ""), (sighting.frame, sighting.target)}):
-            kept.append(sighting)
-        else:
+        if is_excluded(sighting.frame, sighting.target, unwanted):
             skipped.append(SkippedSighting(sighting.frame, sighting.target, SkipReason.EXCLUDED))
+        else:
+            kept.append(sighting)
     return kept, tuple(skipped)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from kgcp.errors import KgcpError, KgcpWarning
+from kgcp.georef.selection import is_excluded
 from kgcp.georef.sighting import Attempt
 from kgcp.io.formats.exclusions import Exclusion
 from kgcp.io.tables.detections import read_detections
@@ -99,11 +100,7 @@ def without_excluded(
     """
     warn_of_unknown(pairs, table)
     unwanted = set(pairs)
-    return [
-        attempt
-        for attempt in attempts
-        if unwanted.isdisjoint({(attempt.frame, ""), (attempt.frame, attempt.target)})
-    ]
+    return [each for each in attempts if not is_excluded(each.frame, each.target, unwanted)]
 
 
 def _warn(unknown: Sequence[Exclusion]) -> None:

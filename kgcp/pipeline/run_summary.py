@@ -76,7 +76,7 @@ class DetectionSummary:
     stages_s : dict of float
         Time that each stage of the work took [s].
     doubts : tuple of Doubt
-        About the prints, from all frames together.
+        About the prints, from up to 10 000 measurements together.
     """
 
     table: Path
@@ -161,7 +161,7 @@ class SummaryBuilder:
         self._reasons: Counter[Reason] = Counter()
         self._details: dict[Reason, Counter[str]] = defaultdict(Counter)
         self._from_exif: Counter[bool] = Counter()  # by whether the time is a whole second
-        self.prints: list[SeenPrint] = []  # of the first frames
+        self.prints: list[SeenPrint] = []  # of the first measurements
 
     def add(self, result: FrameResult) -> None:
         """Count a frame."""

@@ -104,7 +104,7 @@ class ConsistencyEquations:
         weights = 1.0 / np.trace(correlated + independent, axis1=1, axis2=2)
         stated = (
             all(frame.position.cov_m2 is not None for frame in frames)
-            and orientations.cov_m2 is not None
+            and orientations.states_centres
         )
         return cls(
             offset,
@@ -143,7 +143,7 @@ def _independent_m2(
     of_pose = np.array([np.zeros((3, 3)) if cov is None else cov[:3, :3] for cov in measured])
     total = total + attitude @ of_pose @ np.swapaxes(attitude, 1, 2)
     total = total + orientations.place_covariances(rows, sight)
-    if orientations.cov_m2 is None:
+    if not orientations.states_centres:
         total = total + _UNSTATED_SD_M**2 * np.eye(3)
     return np.asarray(total)
 

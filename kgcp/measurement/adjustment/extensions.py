@@ -316,8 +316,8 @@ def _fit_in_even_light(problem: FitProblem, pose: Pose, blur: Blur) -> TwoPoses:
     Raises
     ------
     BinsAreTooCoarse
-        Only if the problem `may_be_finer`: bins show the profile of edges, so that their one tone
-        parameter does not do.
+        Only if the problem `may_be_finer`: bins show the profile of edges, for which one tone
+        parameter is not enough.
     """
     poses = fit_both_poses(problem, pose, blur)
     if problem.may_be_finer and (

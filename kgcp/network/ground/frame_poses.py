@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.attitude import cross_matrix
+from kgcp.geometry.attitude import cross_matrix, place_covariances
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import rotation_about
 from kgcp.georef.sighting import Sighting, unmistakable
@@ -525,11 +525,10 @@ def _agrees(
         return None
     rotation, sight = pose.world_from_camera, pose.world_from_camera @ sighting.pose.translation_m
     residual_m = pose.centre_m + sight - place.position_m
-    by_pose = np.hstack((np.eye(3), -cross_matrix(sight)))
     target_cov = sighting.pose_cov
     if sighting.common_pose_cov is not None:
         target_cov = target_cov + sighting.common_pose_cov
-    total = by_pose @ cov @ by_pose.T + rotation @ target_cov[:3, :3] @ rotation.T
+    total = place_covariances(cov, sight) + rotation @ target_cov[:3, :3] @ rotation.T
     if place.cov_m2 is not None:
         total = total + place.cov_m2
     return bool(residual_m @ np.linalg.solve(total, residual_m) < _AGREEING_CHI2)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.attitude import cross_matrix
+from kgcp.geometry.attitude import place_covariances
 from kgcp.geometry.camera import Camera
 from kgcp.georef.sighting import CAMERA_SPEED_M_S, Sighting
 from kgcp.georef.target_positions import TargetPosition
@@ -98,13 +98,12 @@ def _offset(
         return None
     axes = pose.pose.world_from_camera
     sight_m = axes @ sighting.pose.translation_m
-    by_pose = np.hstack((np.eye(3), -cross_matrix(sight_m)))
     share = max(sd_scale, (sighting.sd_common_distance_m or 0.0) / sighting.distance_m)
     sd_m = _CALIBRATION_SD_PX * sighting.distance_m / camera.mean_focal_px
     shift_m = CAMERA_SPEED_M_S * camera.readout_s * sighting.rows_since_middle(camera)
     own = position.cov_m2
     cov = (
-        by_pose @ pose.cov @ by_pose.T
+        place_covariances(pose.cov, sight_m)
         + axes @ sighting.pose_cov[:3, :3] @ axes.T
         + share**2 * np.outer(sight_m, sight_m)
         + (sd_m**2 + shift_m**2) * np.eye(3)

@@ -194,10 +194,10 @@ def _place_cov(
         enu_from_camera = orientations.enu_from_camera[row]
         cov = cov + enu_from_camera @ sighting.pose_cov[:3, :3] @ enu_from_camera.T
     sd_px = _CALIBRATION_SD_PX
-    if orientations.cov_m2 is None or not orientations.states_angles:
-        sd_px = _UNSTATED_POSE_SD_PX
-    else:
+    if orientations.states_all:
         cov = cov + orientations.place_covariances([row], sight_m[None])[0]
+    else:
+        sd_px = _UNSTATED_POSE_SD_PX
     rows = sighting.rows_since_middle(camera)
     shift_m = CAMERA_SPEED_M_S * camera.readout_s * rows
     variance = _OTHER_SD_M**2 + (sd_px * distance_m / camera.mean_focal_px) ** 2 + shift_m**2

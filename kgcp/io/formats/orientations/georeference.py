@@ -152,13 +152,16 @@ def _on_flight_map(
         )
     transform = CrsTransform.to(crs, local_frame, source.position[0], CRS_KEY)
     flight_from_source = np.array([transform.axes(point) for point in source.position])
-    sd = source.sd_position_m
-    if sd is not None:  # the axes turn; the resulting covariances are left out
+    sd, cov = source.sd_position_m, source.cov
+    if cov is not None:
+        cov = turned_covariance(flight_from_source, cov)
+        sd = np.sqrt(np.diagonal(cov, axis1=1, axis2=2)[:, :3])
+    elif sd is not None:  # the axes turn; the resulting covariances are left out
         sd = np.sqrt(np.einsum("nij,nj->ni", flight_from_source**2, sd**2))
     return replace(
         source,
         position=transform.positions(source.position),
         frame_from_photo=flight_from_source @ source.frame_from_photo,
         sd_position_m=sd,
-        cov=None if source.cov is None else turned_covariance(flight_from_source, source.cov),
+        cov=cov,
     )

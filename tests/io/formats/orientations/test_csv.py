@@ -97,15 +97,29 @@ def test_covariances_of_poses_are_read_as_written(tmp_path: Path) -> None:
 
 
 def test_covariances_follow_the_axes_into_other_coordinates(tmp_path: Path) -> None:
-    """The place below the camera is known to a centimetre in all of them: the errors cancel."""
+    """The grids of two zones are 4° apart; what is along x in one is not in the other."""
+    along_x = np.diag([1e-4, 1e-6, 1e-6])  # of the place below the camera [m²]
+    by_rotation = np.vstack((_ROTATION, np.eye(3))) @ np.array([1e-3, 1e-3, 0.0])
+    cov = np.outer(by_rotation, by_rotation) + np.pad(along_x, (0, 3))
+    place = np.array([448_000.0, 5_411_000.0, 300.0])
+    rows = [
+        pose_csv_cells(name, place + np.array([east_m, 0.0, 0.0]), np.array([1.0, -2.0, 30.0]), cov)
+        for name, east_m in (("a.jpg", 0.0), ("b.jpg", 100.0))
+    ]
+    path = _write(tmp_path, ",".join(POSE_CSV_HEADER), *map(",".join, rows))
     options = OrientationFileOptions(crs="EPSG:25832")
-    poses = read_reference_poses(_posed(tmp_path), options, crs="EPSG:25831")
-    local_frame = LocalFrame.at("EPSG:25831", poses.position_map[0])
-    orientations = ExteriorOrientations.of(poses, local_frame)
+    poses = read_reference_poses(path, options, crs="EPSG:25831")
+    orientations = ExteriorOrientations.of(
+        poses, LocalFrame.at("EPSG:25831", poses.position_map[0])
+    )
+    x = orientations.centre_m[1] - orientations.centre_m[0]
+    x /= np.linalg.norm(x)
+    assert abs(np.degrees(np.arctan2(x[1], x[0]))) > 0.5, "nor is it east"
     below = orientations.place_covariances([0], _SIGHT)[0]
-    np.testing.assert_allclose(below, 1e-4 * np.eye(3), atol=1e-9)
-    assert orientations.cov_m2 is not None
-    assert np.sqrt(np.diag(orientations.cov_m2[0]))[:2] == pytest.approx([0.0316, 0.0316], rel=0.01)
+    np.testing.assert_allclose(below @ x, 1e-4 * x, atol=1e-8)
+    assert poses.cov is not None
+    assert poses.sd_position_m is not None
+    np.testing.assert_allclose(poses.sd_position_m[0], np.sqrt(np.diag(poses.cov[0]))[:3])
 
 
 @pytest.mark.parametrize(
