@@ -19,7 +19,12 @@ from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.measurement.adjustment.acceptance import check_code, check_fit, check_precision
 from kgcp.measurement.adjustment.appearance import appearance_of, imaging_of
-from kgcp.measurement.adjustment.covariance import ambiguity_cov, pose_covariance, propagate
+from kgcp.measurement.adjustment.covariance import (
+    PoseCovariance,
+    ambiguity_cov,
+    pose_covariance,
+    propagate,
+)
 from kgcp.measurement.adjustment.extensions import (
     BinsAreTooCoarse,
     fit_in_any_light,
@@ -132,11 +137,13 @@ def _checked(
     prior: NormalPrior | None,
 ) -> Measurement:
     """Choose between the two poses, test the fit, and make the measurement."""
+    covariance = None
     if prior is not None:
-        poses = choose_by_prior(poses.best.sample.problem, poses, prior)
+        poses, covariance = choose_by_prior(poses.best.sample.problem, poses, prior)
     check_fit(poses.best)
     check_code(poses.best)
-    measurement = _measurement(camera, target, start, poses, prior)
+    covariance = covariance or pose_covariance(poses.best)
+    measurement = _measurement(camera, target, start, poses, covariance, prior)
     check_precision(measurement)
     return measurement
 
@@ -252,11 +259,12 @@ def _measurement(
     target: Target,
     start: InitialPose,
     poses: TwoPoses,
+    covariance: PoseCovariance,
     prior: NormalPrior | None,
 ) -> Measurement:
+    """Make the measurement; `covariance` is that of the better pose."""
     best, other = poses.best, poses.other
     pose = best.parameters.pose
-    covariance = pose_covariance(best)
     ambiguity = max(0.0, advantage(poses, covariance, prior))
     pose_cov = covariance.pose_cov.copy()
     pose_cov[:3, :3] += ambiguity_cov(pose, other.parameters.pose, ambiguity)

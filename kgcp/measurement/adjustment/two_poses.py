@@ -115,18 +115,28 @@ def _approach(problem: FitProblem, pose: Pose, blur: Blur) -> TargetFit:
     return approach(sample, Parameters.of(pose, blur, light), unknowns)
 
 
-def choose_by_prior(problem: FitProblem, poses: TwoPoses, prior: NormalPrior) -> TwoPoses:
-    """Exchange the poses if the prior outweighs the image, and adjust the new best one."""
-    if advantage(poses, pose_covariance(poses.best), prior) >= 0.0:
-        return poses
+def choose_by_prior(
+    problem: FitProblem, poses: TwoPoses, prior: NormalPrior
+) -> tuple[TwoPoses, PoseCovariance]:
+    """Exchange the poses if the prior outweighs the image, and adjust the new best one.
+
+    Returns
+    -------
+    TwoPoses, PoseCovariance
+        The covariance is that of the best one.
+    """
+    covariance = pose_covariance(poses.best)
+    if advantage(poses, covariance, prior) >= 0.0:
+        return poses, covariance
     if poses.best.level_equations is None:
         best = adjust(problem, poses.other.parameters, poses.best.unknowns)
         turned = TwoPoses(best, _mirrored_fit(best))
     else:
         turned = TwoPoses(poses.other, poses.best)
-        best = turned.best
-    is_better = advantage(turned, pose_covariance(best), prior) >= 0.0
-    return turned if is_better else poses
+    turned_covariance = pose_covariance(turned.best)
+    if advantage(turned, turned_covariance, prior) >= 0.0:
+        return turned, turned_covariance
+    return poses, covariance
 
 
 def advantage(poses: TwoPoses, covariance: PoseCovariance, prior: NormalPrior | None) -> float:
