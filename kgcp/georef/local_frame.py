@@ -9,6 +9,7 @@ and its north is not true north.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Self
 
 import numpy as np
@@ -63,27 +64,7 @@ class LocalFrame:
             If the CRS is unknown or has no horizontal axes, if its heights need a grid that is
             not installed, or if the origin lies outside the projection's domain.
         """
-        horizontal = parse_crs(crs, where)
-        geodetic = horizontal.geodetic_crs
-        if geodetic is None or horizontal.is_geocentric:
-            raise KgcpError(
-                f"{where} {crs!r} has no easting and northing or longitude and latitude;"
-                " give a projected or geographic CRS"
-            )
-        ellipsoid = geodetic.ellipsoid
-        if ellipsoid is None:
-            raise KgcpError(f"{where} {crs!r} has no ellipsoid; give a CRS that has one")
-        geodetic_from_map = best_transformer(
-            horizontal,
-            geodetic.to_2d().to_3d(),  # in metres, also if the heights of `geodetic` are in feet
-            f"{where} {crs!r}: the transformation from its heights to ellipsoidal ones",
-            "give ellipsoidal heights and the horizontal CRS alone",
-        )
-        cart = Transformer.from_pipeline(
-            f"+proj=cart +a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r}"
-        )
-        unit = geodetic.axis_info[0].unit_conversion_factor
-        draft = cls(crs, np.zeros(3), np.eye(3), geodetic_from_map, cart, unit, where)
+        draft = cls(crs, np.zeros(3), np.eye(3), *_operations_of(crs, where), where)
         geodetic_origin = draft._geodetic(np.reshape(np.asarray(origin_map, float), (1, 3)))
         return replace(
             draft,
@@ -199,6 +180,34 @@ class LocalFrame:
                 " give the CRS of the coordinates, x = easting or longitude first"
             )
         return result
+
+
+@lru_cache(maxsize=8)
+def _operations_of(crs: str, where: str) -> tuple[Transformer, Transformer, float]:
+    """Return the operations of `LocalFrame` for a CRS, and its geodetic unit [rad].
+
+    PROJ takes 20 ms to find them, and a run has several frames of the same CRS.
+    """
+    horizontal = parse_crs(crs, where)
+    geodetic = horizontal.geodetic_crs
+    if geodetic is None or horizontal.is_geocentric:
+        raise KgcpError(
+            f"{where} {crs!r} has no easting and northing or longitude and latitude;"
+            " give a projected or geographic CRS"
+        )
+    ellipsoid = geodetic.ellipsoid
+    if ellipsoid is None:
+        raise KgcpError(f"{where} {crs!r} has no ellipsoid; give a CRS that has one")
+    geodetic_from_map = best_transformer(
+        horizontal,
+        geodetic.to_2d().to_3d(),  # in metres, also if the heights of `geodetic` are in feet
+        f"{where} {crs!r}: the transformation from its heights to ellipsoidal ones",
+        "give ellipsoidal heights and the horizontal CRS alone",
+    )
+    cart = Transformer.from_pipeline(
+        f"+proj=cart +a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r}"
+    )
+    return geodetic_from_map, cart, geodetic.axis_info[0].unit_conversion_factor
 
 
 def _level_axes(geodetic: FloatArray) -> FloatArray:
