@@ -37,7 +37,13 @@ from kgcp.quality.checks.clock import (
     check_overlap,
     check_same_times,
 )
-from kgcp.quality.checks.course import Course, check_attitude, check_steady_offsets, course_of
+from kgcp.quality.checks.course import (
+    Course,
+    check_attitude,
+    check_flips,
+    check_steady_offsets,
+    course_of,
+)
 from kgcp.quality.checks.deviations import (
     check_deviations,
     check_pose_deviations,
@@ -242,10 +248,13 @@ class FlightInputs:
             doubts += check_vehicle_deviations(flight.vehicle.settings)
         if self.target_positions is not None and not _has_wrong_places(doubts):
             doubts += check_attitude(self.course)
-            if self.target_positions.vehicle is not None:
-                doubts += check_steady_offsets(self.course, self.target_positions.vehicle.settings)
-                doubts += check_spikes(self.target_positions.vehicle.motion)
-                doubts += check_deviations(self.target_positions.vehicle.motion)
+            vehicle = self.target_positions.vehicle
+            if vehicle is not None and self.trajectory is not None:
+                headings_deg = self.trajectory.attitude_deg[:, 2]
+                doubts += check_steady_offsets(self.course, vehicle.settings)
+                doubts += check_flips(vehicle.motion, headings_deg, vehicle.settings)
+                doubts += check_spikes(vehicle.motion)
+                doubts += check_deviations(vehicle.motion)
             if self.reference_poses is not None:
                 doubts += check_reference(self.reference_poses, self.target_positions)
         poses = self.reference_poses

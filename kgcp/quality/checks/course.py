@@ -10,8 +10,10 @@ import numpy as np
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.georef.target_positions import Vehicle
+from kgcp.georef.trajectory import Motion
+from kgcp.georef.unix_time import date_of
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
-from kgcp.quality.number_text import amount, minus, rounded
+from kgcp.quality.number_text import amount, counted, minus, rounded
 from kgcp.settings import VehicleSettings
 
 _MAX_OFF_DEG = 20.0  # of headings from the course; crab angles and GNSS noise are far smaller
@@ -41,6 +43,8 @@ _MIN_SPEED_M_S = 1.0
 _MIN_EPOCHS = 10
 _MIN_EXTENT_M = 10.0  # of the drive
 _MAX_EPOCHS = 20_000  # more would tell nothing new
+_MIN_FLIP_DEG, _MAX_FLIP_S = 120.0, 2.0  # between two epochs: no vehicle turns so fast
+_MIN_FLIPPED_M = 0.02  # displacement of the target by half a turn of the heading
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,6 +116,33 @@ def check_attitude(course: Course | None) -> Iterator[Doubt]:
         if course.median_off_deg > _MAX_OFF_DEG:
             yield _wrong_heading(course)
         yield from _check_level(course)
+
+
+def check_flips(
+    motion: Motion, heading_deg: FloatArray, settings: VehicleSettings
+) -> Iterator[Doubt]:
+    """Yield the doubt about headings (n,) that turn to the other side from one epoch to the next.
+
+    The course over ground does so where a vehicle reverses, and so do two antennas that are taken
+    for each other. The target is then on the other side of the trajectory point.
+    """
+    steps_s, turns_deg = np.diff(motion.time_s), np.abs(_wrapped(np.diff(heading_deg)))
+    flips = np.flatnonzero((turns_deg > _MIN_FLIP_DEG) & (steps_s < _MAX_FLIP_S))
+    aside_m = 2.0 * math.hypot(*settings.lever_arm_m[:2])
+    if not flips.size or aside_m < _MIN_FLIPPED_M:
+        return
+    first = int(flips[0])
+    after_utc = f"{date_of(float(motion.time_s[first])):%Y-%m-%d %H:%M:%S}"
+    later = f", and {counted(len(flips) - 1, 'time')} later" if len(flips) > 1 else ""
+    yield mild(
+        Cause.HEADING,
+        f"headings turn by {turns_deg[first]:.0f}° in {rounded(float(steps_s[first]))} s after"
+        f" {after_utc} UTC{later}: no vehicle turns so fast; if it reverses on one side of such a"
+        f" turn, points there are displaced by {rounded(aside_m)} m",
+        "give a trajectory with the headings of the vehicle itself, or delete the epochs in which"
+        " it reverses, so that frames get no points there",
+        {"turn_deg": float(turns_deg[first]), "times": float(len(flips)), "aside_m": aside_m},
+    )
 
 
 Reading = tuple[str, str, Callable[[FloatArray], FloatArray]]

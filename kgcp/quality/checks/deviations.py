@@ -1,4 +1,4 @@
-"""Checks of standard deviations: those that are 0, or seem to be in another unit."""
+"""Checks of standard deviations: those that are 0, in another unit, or too small."""
 
 from __future__ import annotations
 
@@ -10,13 +10,21 @@ from kgcp.geometry.arrays import BoolArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.georef.trajectory import Motion
 from kgcp.quality.checks.doubt import Cause, Doubt, mild
-from kgcp.quality.number_text import counted
+from kgcp.quality.number_text import counted, rounded
 from kgcp.settings import VehicleSettings
 from kgcp.targets.plain import AnyTarget
 
 _MIN_SD_M, _MAX_SD_M = 0.0005, 10.0  # usual range of a receiver's positions
 _MAX_LEVER_ARM_SD_M, _MAX_TIME_SD_S = 0.5, 0.5
 _MAX_TARGET_SD_M = 5.0  # a hand-held receiver is better
+# Scatter from epoch to epoch that is doubted: the least one, its least ratio to the stated standard
+# deviations, and what a vehicle's accelerations may add to it.
+_MIN_SCATTER_M, _MIN_SCATTER_RATIO, _SCATTER_M_S2 = 0.02, 2.0, 1.0
+_SCATTER_STEP_S = 0.1
+_FOURTH_DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
+_EVEN_STEPS = 1.2  # ratio of the longest to the shortest
+_MIN_DIFFERENCES, _MAX_DIFFERENCES = 20, 100_000
+_SD_OF_MEDIAN = 1.4826  # of a normal distribution over the median of absolute deviations
 _REMEDY = (
     "give those of the receiver's software, or remove their columns from the trajectory's file"
 )
@@ -26,8 +34,8 @@ _POSES_REMEDY = "give those of the adjustment, or remove their columns from the 
 def check_deviations(motion: Motion) -> Iterator[Doubt]:
     """Yield doubts about standard deviations of a trajectory.
 
-    These are epochs whose position or attitude counts as exact, and deviations that seem to be in
-    millimetres or to be variances.
+    These are epochs whose position or attitude counts as exact, deviations that seem to be in
+    millimetres or to be variances, and those that are smaller than the positions' scatter.
     """
     sd_m = motion.sd_position_m
     if sd_m is not None:
@@ -39,11 +47,56 @@ def check_deviations(motion: Motion) -> Iterator[Doubt]:
             yield _in_another_unit(usual_m.min(), "which suggests variances, or values in degrees")
         elif usual_m.max() > _MAX_SD_M:
             yield _in_another_unit(usual_m.max(), "which suggests millimetres")
+        elif usual_m.min() > 0.0:
+            yield from _scatter(motion, float(np.linalg.norm(usual_m)))
     if motion.sd_attitude_deg is not None:
         effect = "the lever arm's direction counts as exact"
         # of all three angles: level ground may be known better than can be written
         is_zero = np.all(motion.sd_attitude_deg == 0.0, axis=1)
         yield from _zeros(is_zero, "trajectory's attitudes", "epochs", effect, _REMEDY)
+
+
+def _scatter(motion: Motion, stated_m: float) -> Iterator[Doubt]:
+    """Yield the doubt about positions that scatter from epoch to epoch by more than is stated.
+
+    The fourth differences of evenly spaced positions are those of their errors: a vehicle's motion
+    hardly has any. A receiver's errors change slowly, so that they scatter by less than is stated.
+    Rounded coordinates scatter by 0.3 of their steps.
+    """
+    usual_s = float(np.median(np.diff(motion.time_s)))
+    # a fast logger's rounded positions mostly repeat from epoch to epoch
+    for every in sorted({1, max(1, round(_SCATTER_STEP_S / usual_s))}):
+        scatter_m = _scatter_m(motion, every)
+        by_motion_m = _SCATTER_M_S2 * (every * usual_s) ** 2
+        if scatter_m <= max(_MIN_SCATTER_M, _MIN_SCATTER_RATIO * stated_m, by_motion_m):
+            continue
+        yield mild(
+            Cause.STANDARD_DEVIATIONS,
+            f"the trajectory's positions scatter by {rounded(scatter_m)} m from epoch to epoch, but"
+            f" their standard deviations are {rounded(stated_m)} m (medians): points are less"
+            " accurate than is stated",
+            "export the trajectory again with all digits of its coordinates, if they were rounded;"
+            " otherwise give standard deviations that include this scatter",
+            {"scatter_m": scatter_m, "sd_m": stated_m},
+        )
+        return
+
+
+def _scatter_m(motion: Motion, every: int) -> float:
+    """Return the scatter of every k-th position about its neighbours [m]; 0: not known."""
+    time_s, position_m = motion.time_s[::every], motion.position_m[::every]
+    width = len(_FOURTH_DIFFERENCE)
+    if len(time_s) < width:
+        return 0.0
+    steps_s = np.lib.stride_tricks.sliding_window_view(np.diff(time_s), width - 1)
+    even = np.flatnonzero(steps_s.max(axis=1) <= _EVEN_STEPS * steps_s.min(axis=1))
+    if len(even) < _MIN_DIFFERENCES:
+        return 0.0
+    even = even[:: -(-len(even) // _MAX_DIFFERENCES)]
+    windows = np.lib.stride_tricks.sliding_window_view(position_m, width, axis=0)
+    usual_m = np.median(np.abs(windows[even] @ _FOURTH_DIFFERENCE), axis=0)
+    of_one = _SD_OF_MEDIAN / np.linalg.norm(_FOURTH_DIFFERENCE)
+    return float(of_one * np.linalg.norm(usual_m))
 
 
 def check_pose_deviations(poses: ReferencePoses) -> Iterator[Doubt]:

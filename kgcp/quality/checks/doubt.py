@@ -67,16 +67,16 @@ class Cause(StrEnum):
     CRS = "crs", "the coordinates are not in the CRS that is named"
     HEADING = (
         "heading",
-        "headings do not follow the course: another zero direction or sense, or an offset",
+        "headings do not follow the course: another zero direction or sense, offset, reversing",
     )
     ATTITUDE = "attitude", "roll or pitch are not those of a vehicle on a road"
     TRAJECTORY_SPIKE = (
         "trajectory_spike",
-        "epochs of the trajectory lie far from those before and after them, or repeat a position",
+        "epochs of the trajectory lie far from those before or after them, or repeat a position",
     )
     STANDARD_DEVIATIONS = (
         "standard_deviations",
-        "standard deviations are 0, or seem to be in another unit",
+        "standard deviations are 0, in another unit, or smaller than the scatter of the positions",
     )
     LEVER_ARM = "lever_arm", "an axis of the lever arm is wrong, or several targets share it"
     MOUNT = "mount_deg", "the plate is mounted in another direction than mount_deg says"

@@ -14,7 +14,8 @@ from kgcp.georef.unix_time import date_of
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
 from kgcp.quality.number_text import counted, rounded
 
-_MIN_JUMP_M = 1.5  # coordinates in degrees with five decimals have steps of 1.1 m
+_MIN_JUMP_M = 0.1
+_MIN_UNSTATED_JUMP_M = 1.5  # without standard deviations: five decimals of a degree are 1.1 m
 _MAX_ACCELERATION_M_S2 = 10.0
 _MAX_SDS = 8.0  # of an epoch's offset, in standard deviations of the position
 _MAX_RATIO = 6.0  # of an offset to the median, if standard deviations are too small or not stated
@@ -23,7 +24,8 @@ _RETURN_SHARE = 0.5  # of the jump; a run of wrong epochs must return to the pat
 _MAX_RUN_S = 10.0  # two jumps farther apart may be two changes of the ambiguities
 _MAX_AT_END = 3  # epochs at an end; if there are more, they may be right and the others wrong
 _MIN_EPOCHS = 8  # in a trajectory, to decide which part is wrong
-_MIN_LASTING_JUMP_M = 10.0  # no other solution of the ambiguities is so far away
+_MIN_OTHER_PLACE_M = 10.0  # no other solution of the ambiguities is so far away
+_MAX_JUMPS = 0.02  # share of the epochs; if there are more, all positions scatter
 _MAX_SPEED_M_S = 50.0  # over a gap, unless the vehicle is half as fast elsewhere
 _MIN_ALTERNATION_M = 0.2  # distance of two paths between which epochs alternate
 _MAX_BRAKING_M_S2 = 6.0
@@ -32,6 +34,11 @@ _MIN_SAME_S = 0.5  # that a position must be repeated, and over which the speed 
 _JOINED_REMEDY = (
     "if files of several vehicles, receivers or CRS were joined, make a flight folder of each;"
     " 'kgcp export-gcp FLIGHT FLIGHT --out FOLDER' joins their points"
+)
+_OTHER_SOLUTION_REMEDY = (
+    "look whether the receiver changed its solution there (fixed, float), and delete the epochs of"
+    " the worse one, or state their true accuracy: points before or after are off by more than is"
+    " stated"
 )
 
 
@@ -67,6 +74,11 @@ class _Path:
         off_m[1:-1] = self.off_line_m(inner - 1, inner, inner + 1)
         return off_m
 
+    @property
+    def min_jump_m(self) -> float:
+        """Least jump that is not taken for the steps of rounded coordinates."""
+        return _MIN_UNSTATED_JUMP_M if self.motion.sd_position_m is None else _MIN_JUMP_M
+
     @cached_property
     def is_far(self) -> BoolArray:
         """Whether epochs (n,) are farther from that line than errors and accelerations allow."""
@@ -78,7 +90,7 @@ class _Path:
             sd_m = np.linalg.norm(self.motion.sd_position_m[self.epochs], axis=1)
             allowed_m[1:-1] += _MAX_SDS * np.max([sd_m[:-2], sd_m[1:-1], sd_m[2:]], axis=0)
         usual_m = float(np.median(off_m[1:-1]))
-        return np.asarray(off_m > np.maximum(allowed_m, max(_MIN_JUMP_M, _MAX_RATIO * usual_m)))
+        return np.asarray(off_m > np.maximum(allowed_m, max(self.min_jump_m, _MAX_RATIO * usual_m)))
 
     @cached_property
     def jumps(self) -> IndexArray:
@@ -115,6 +127,8 @@ def check_spikes(motion: Motion) -> Iterator[Doubt]:
     seconds; a jump without return is another solution of the ambiguities. Among the first and last
     three epochs, those that jump away from all others are wrong. Jumps of more than ten metres that
     stay, and epochs that alternate between two paths, are those of several trajectories in one.
+    Smaller jumps that stay are those to another solution of the ambiguities, and are doubted if the
+    stated standard deviations do not allow them.
     """
     whole = _Path(motion, np.arange(len(motion.time_s)))
     apart_m = _alternation_m(whole)
@@ -212,26 +226,37 @@ def _lasting_jumps(path: _Path) -> Iterator[Doubt]:
     speed_m_s = move_m / steps_s[steps]
     is_too_fast = speed_m_s > max(_MAX_SPEED_M_S, 2.0 * float(np.quantile(speed_m_s, 0.9)))
     is_jump = (jump_m > allowed_m) | (is_too_fast & (steps_s[steps] > path.motion.max_gap_s))
-    least_m = max(_MIN_LASTING_JUMP_M, _MAX_RATIO * float(np.median(jump_m)))
-    size_m = np.where(steps_s[steps] > path.motion.max_gap_s, move_m, jump_m)
-    rows = np.flatnonzero(is_jump & (size_m > least_m))
-    if not rows.size:
+    is_gap = steps_s[steps] > path.motion.max_gap_s
+    size_m = np.where(is_gap, move_m, jump_m)
+    usual_m = _MAX_RATIO * float(np.median(jump_m))
+    is_other_place = is_jump & (size_m > max(_MIN_OTHER_PLACE_M, usual_m))
+    is_other_solution = is_jump & ~is_gap & (size_m > max(_MIN_JUMP_M, usual_m))
+    if is_other_place.any():
+        rows, doubt = np.flatnonzero(is_other_place), grave
+        words, remedy = "no vehicle drives so", _JOINED_REMEDY
+    elif path.motion.sd_position_m is not None and 0.0 < is_other_solution.mean() < _MAX_JUMPS:
+        rows, doubt = np.flatnonzero(is_other_solution), mild
+        words = "more than the trajectory's standard deviations and a vehicle's acceleration allow"
+        remedy = _OTHER_SOLUTION_REMEDY
+    else:
         return
     worst = int(rows[np.argmax(size_m[rows])])
     length = _metres(float(size_m[worst]))
     after_utc = _utc(float(path.time_s[steps[worst]]))
     others = len(rows) - 1
     more = f", and at {counted(others, 'other place')} less far" if others else ""
-    yield grave(
+    yield doubt(
         Cause.TRAJECTORY_SPIKE,
         f"the trajectory jumps by {length} in {rounded(float(steps_s[steps[worst]]))} s after"
-        f" {after_utc} UTC, and goes on from there{more}: no vehicle drives so",
-        _JOINED_REMEDY,
+        f" {after_utc} UTC, and goes on from there{more}: {words}",
+        remedy,
         {"jump_m": float(size_m[worst]), "jumps": float(len(rows))},
     )
 
 
 def _metres(length_m: float) -> str:
+    if length_m < _MIN_OTHER_PLACE_M:
+        return f"{rounded(length_m)} m"
     return f"{length_m:.0f} m" if length_m < 10_000.0 else f"{length_m / 1000.0:.0f} km"
 
 

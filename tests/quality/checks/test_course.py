@@ -8,8 +8,14 @@ import pytest
 from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.target_positions import Vehicle
-from kgcp.georef.trajectory import Trajectory
-from kgcp.quality.checks.course import Course, check_attitude, check_steady_offsets, course_of
+from kgcp.georef.trajectory import Trajectory, attitude_from_course
+from kgcp.quality.checks.course import (
+    Course,
+    check_attitude,
+    check_flips,
+    check_steady_offsets,
+    course_of,
+)
 from kgcp.quality.checks.doubt import Cause
 from kgcp.quality.checks.lever_arm import check_lever_arm, lever_arm_text
 from kgcp.settings import VehicleSettings
@@ -164,3 +170,23 @@ def test_lever_arms_are_described_and_implausible_ones_are_doubted() -> None:
     assert "81.4 m long" in far.sentence
     (shared,) = check_lever_arm(arm, ["A", "B"])
     assert "targets A and B share one lever arm" in shared.sentence
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 20.0])
+def test_a_course_that_turns_about_where_the_vehicle_reverses_is_doubted(rate_hz: float) -> None:
+    time_s = np.arange(0.0, 90.0, 1.0 / rate_hz)
+    way_m = 4.0 * np.interp(time_s, [0.0, 30.0, 40.0, 55.0, 90.0], [0.0, 30.0, 30.0, 15.0, 50.0])
+    angle = 0.05 * way_m
+    position = ORIGIN + 20.0 * np.column_stack((np.sin(angle), np.cos(angle), 0.0 * angle))
+    position += np.random.default_rng(1).normal(0.0, 0.01, position.shape)
+    attitude = attitude_from_course("vehicle.csv", time_s, position, "EPSG:25832")
+    trajectory = Trajectory(1_781_597_700.0 + time_s, position, attitude, None, None)
+    vehicle = Vehicle.on(trajectory, ARM, LocalFrame.at("EPSG:25832", ORIGIN))
+    (doubt,) = check_flips(vehicle.motion, attitude[:, 2], ARM)
+    assert (doubt.code, doubt.is_grave, doubt.figures["times"]) == (Cause.HEADING, False, 2.0)
+    assert "UTC, and 1 time later: no vehicle turns so fast" in doubt.sentence
+    assert "points there are displaced by 1.6 m" in doubt.sentence
+    of_vehicle = np.degrees(angle) + 90.0
+    assert not [*check_flips(vehicle.motion, of_vehicle % 360.0, ARM)]
+    above = VehicleSettings(lever_arm_m=(0.0, 0.0, -1.95))
+    assert not [*check_flips(vehicle.motion, attitude[:, 2], above)]

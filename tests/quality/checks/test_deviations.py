@@ -77,6 +77,36 @@ def test_deviations_of_another_unit_are_doubted(factors: FloatArray, words: str)
     assert (doubt.code, doubt.is_grave) == (Cause.STANDARD_DEVIATIONS, False)
 
 
+def _driven(rate_hz: float) -> Motion:
+    """A bend at 9 m/s; 2 cm are stated, and errors are 1 cm."""
+    time_s = np.arange(0.0, 60.0, 1.0 / rate_hz)
+    angle = 0.3 * time_s
+    position = np.column_stack((30.0 * np.cos(angle), 30.0 * np.sin(angle), 0.1 * time_s))
+    position += np.random.default_rng(2).normal(0.0, 0.01, position.shape)
+    turns = np.broadcast_to(np.eye(3), (len(time_s), 3, 3)).copy()
+    return Motion(time_s, position, turns, np.full_like(position, 0.02), None)
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 5.0, 20.0, 100.0])
+def test_positions_that_scatter_by_less_than_is_stated_raise_no_doubt(rate_hz: float) -> None:
+    driven = _driven(rate_hz)
+    assert not [*check_deviations(driven)]
+    gap = replace(driven, time_s=driven.time_s + (driven.time_s > 20.0) * 100.0)
+    assert not [*check_deviations(gap)]
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 20.0, 100.0])
+def test_positions_that_scatter_by_more_than_is_stated_are_doubted(rate_hz: float) -> None:
+    driven = _driven(rate_hz)
+    noise = np.random.default_rng(3).normal(0.0, 0.1, driven.position_m.shape)
+    (noisy,) = check_deviations(replace(driven, position_m=driven.position_m + noise))
+    assert (noisy.code, noisy.is_grave) == (Cause.STANDARD_DEVIATIONS, False)
+    assert noisy.figures["scatter_m"] == pytest.approx(np.sqrt(3.0) * 0.1, rel=0.15)
+    assert noisy.figures["sd_m"] == pytest.approx(np.sqrt(3.0) * 0.02)
+    (coarse,) = check_deviations(replace(driven, position_m=np.round(driven.position_m)))
+    assert coarse.remedy.startswith("export the trajectory again with all digits")
+
+
 def test_deviations_of_the_vehicle_in_thousandths_are_doubted() -> None:
     usual = VehicleSettings(sd_lever_arm_m=(0.005, 0.005, 0.01), sd_time_s=0.02)
     assert not [*check_vehicle_deviations(usual)]

@@ -112,16 +112,30 @@ def test_noise_raises_no_doubt(rate_hz: float, noise_m: float, sd_m: float | Non
     assert not [*check_spikes(motion(time_s, driven(time_s) + noise, sd_m))]
 
 
-def test_a_jump_that_stays_and_coarse_numbers_raise_no_doubt() -> None:
+@pytest.mark.parametrize("rate_hz", [10.0, 20.0, 100.0])
+@pytest.mark.parametrize("jump_m", [0.5, 4.0])
+def test_a_jump_to_another_solution_is_doubted_if_deviations_are_small(
+    rate_hz: float, jump_m: float
+) -> None:
+    time_s = np.arange(0.0, 60.0, 1.0 / rate_hz)
+    position_m = driven(time_s)
+    position_m[time_s >= 30.0] += np.array([jump_m, 0.0, 0.0])
+    position_m[time_s < 2.0] += np.array([0.0, jump_m, 0.0])
+    (doubt,) = check_spikes(motion(time_s, position_m))
+    assert (doubt.code, doubt.is_grave) == (Cause.TRAJECTORY_SPIKE, False)
+    assert "UTC, and goes on from there, and at 1 other place less far" in doubt.sentence
+    assert doubt.figures["jump_m"] == pytest.approx(jump_m, abs=0.1)
+    assert not [*check_spikes(motion(time_s, position_m, 1.0))]  # a float solution, as stated
+
+
+def test_jumps_without_deviations_and_coarse_numbers_raise_no_doubt() -> None:
     time_s = np.arange(0.0, 60.0, 0.1)
     position_m = driven(time_s)
-    position_m[300:] += np.array([4.0, 0.0, 0.0])  # another solution of the ambiguities
-    assert not [*check_spikes(motion(time_s, position_m))]
-    position_m[:20] += np.array([0.0, 3.0, 5.0])  # fixed after two seconds
-    assert not [*check_spikes(motion(time_s, position_m))]
-    position_m[500:] -= np.array([4.0, 0.0, 0.0])  # and the first solution again, 20 s later
-    assert not [*check_spikes(motion(time_s, position_m))]
-    assert not [*check_spikes(motion(time_s, np.round(driven(time_s) / 1.1) * 1.1, None))]
+    coarse = np.round(position_m / 1.1) * 1.1
+    assert not [*check_spikes(motion(time_s, coarse, None))]
+    assert not [*check_spikes(motion(time_s, coarse))]  # the positions scatter: another doubt
+    position_m[300:] += np.array([4.0, 0.0, 0.0])
+    assert not [*check_spikes(motion(time_s, position_m, None))]
 
 
 def test_stops_and_turns_about_raise_no_doubt() -> None:
