@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -26,6 +27,8 @@ from kgcp.io.formats.frame_times import FrameTimes
 from kgcp.io.images.exif import read_frame_header
 from kgcp.io.images.frames import list_frames
 from kgcp.io.images.remote import StoredFolder, at_hand
+from kgcp.io.tables.provenance import TARGET_TABLE
+from kgcp.io.tables.staleness import changed_since_orient, shown
 from kgcp.quality.checks.calibration import check_camera
 from kgcp.quality.checks.camera_position import check_camera_position
 from kgcp.quality.checks.clock import (
@@ -258,8 +261,9 @@ class FlightInputs:
             if self.reference_poses is not None:
                 doubts += check_reference(self.reference_poses, self.target_positions)
         poses = self.reference_poses
-        if poses is not None:
+        if poses is not None and flight.reference is not None:
             doubts += check_pose_deviations(poses)
+            doubts += outdated_poses(flight.reference.file, flight)
         is_doubted = any(doubt.is_grave or doubt.code in _OF_TIMES for doubt in doubts)
         if poses is not None and not is_doubted:
             doubts += check_visibility(poses.frames, self.frames, self.expected_radii_px)
@@ -368,6 +372,25 @@ class FlightInputs:
 def _has_wrong_places(doubts: Sequence[Doubt]) -> bool:
     """Tell whether places are so doubtful that what follows from them means nothing."""
     return any(doubt.code in _OF_PLACES for doubt in doubts)
+
+
+def outdated_poses(file: Path, flight: Flight) -> tuple[Doubt, ...]:
+    """Return the doubt about poses by `kgcp orient` if flight.toml has been changed since.
+
+    It is grave if camera or crs have been changed.
+    """
+    changes = changed_since_orient(file, flight)
+    if not changes:
+        return ()
+    doubt = mild if all(change.startswith(TARGET_TABLE) for change in changes) else grave
+    return (
+        doubt(
+            Cause.REFERENCE,
+            f"{file}: 'kgcp orient' computed these poses before flight.toml was changed:"
+            f" {shown(changes)}",
+            "repeat 'kgcp orient', after 'kgcp detect' if that must be repeated, too",
+        ),
+    )
 
 
 def missing_files(flight: Flight) -> tuple[Doubt, ...]:

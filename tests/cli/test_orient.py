@@ -21,9 +21,12 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.io.flight.field_file import field_toml
+from kgcp.io.flight.flight import read_flight
 from kgcp.io.tables.detections import DETECTION_COLUMNS, read_detections
 from kgcp.io.tables.parquet import write_table
 from kgcp.pipeline.calibration.simulation import FieldSimulation
+from kgcp.pipeline.flight_inputs import outdated_poses
+from kgcp.quality.checks.doubt import Cause
 from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, photograph
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.presets import preset
@@ -209,6 +212,40 @@ def test_positions_as_good_as_stated_contradict_nothing(tmp_path: Path, seed: in
     assert json.loads(result.stdout)["doubts"] == []
     off, sds = poses_of(folder, flight)
     assert 0.2 < float(np.sqrt(np.mean((off / sds) ** 2))) < 1.7
+
+
+@pytest.mark.parametrize("is_copied", [False, True])
+def test_poses_from_before_a_change_of_flight_toml_are_doubted(
+    tmp_path: Path, *, is_copied: bool
+) -> None:
+    folder = GroundFlight(frames=3).write(tmp_path / "flight")
+    toml = folder / "flight.toml"
+    written = toml.read_text("utf-8")
+    assert run("orient", folder).exit_code == 0
+    poses = folder / "kgcp" / "poses.csv"
+    poses = Path(shutil.copy(poses, folder / "by_targets.csv")) if is_copied else poses
+    flight = read_flight(folder)
+    assert not outdated_poses(poses, flight)
+    assert not outdated_poses(folder / "reference.csv", flight)
+    accuracy = written.replace("fx = ", "sd_fx = 0.5\nsd_fy = 0.5\nfx = ")
+    toml.write_text(accuracy, encoding="utf-8")
+    assert not outdated_poses(poses, read_flight(folder))  # poses do not depend on it
+    toml.write_text(written.replace("5336205.0, 545.5", "5336205.0, 545.6"), encoding="utf-8")
+    (moved,) = outdated_poses(poses, read_flight(folder))
+    assert (moved.code, moved.is_grave) == (Cause.REFERENCE, False)
+    assert "[[target]] B position_m ([689416, 5336205, 545.5] → [" in moved.sentence
+    toml.write_text(written.replace("fx = 2300.0", "fx = 2320.0"), encoding="utf-8")
+    (camera,) = outdated_poses(poses, read_flight(folder))
+    assert camera.is_grave
+    assert camera.sentence.endswith("flight.toml was changed: [camera] fx (2300 → 2320)")
+    # the detections, written here, do not state their camera
+    placed = run("place", folder, "--poses", poses, "--json")
+    assert json.loads(placed.stdout)["doubts"][0] == str(camera)
+    toml.write_text(
+        toml.read_text("utf-8").replace('"reference.csv"', f'"{poses.as_posix()}"'),
+        encoding="utf-8",
+    )
+    assert str(camera) in run("export-gcp", folder).stderr
 
 
 def test_positions_without_stated_accuracy_are_named(tmp_path: Path) -> None:

@@ -43,6 +43,7 @@ from kgcp.targets.plain import PlainTarget
 TARGET_TABLE = "[[target]]"
 """Prefix of the keys of targets among the inputs of detections."""
 
+_CAMERA_ACCURACIES = ("[camera] sd_", "[camera] cov", "[camera] plumb_sd_deg")
 _SCALE_DIGITS = 12  # significant; the scale of a replica is computed from diameters
 _DIGITS = 32  # of a digest: 128 bits
 _PREFIX = b"kgcp."  # of the keys of Parquet's metadata
@@ -228,6 +229,36 @@ def detection_inputs(flight: Flight) -> dict[str, object]:
     return values
 
 
+def orientation_provenance(flight: Flight, poses: bytes) -> dict[str, str]:
+    """Return the metadata of `poses.parquet` by which `poses.csv` is recognised as outdated.
+
+    Parameters
+    ----------
+    poses : bytes
+        The content of `poses.csv`.
+    """
+    return {
+        "poses_csv": content_digest(poses),
+        "orientation_inputs": json.dumps(orientation_inputs(flight)),
+    }
+
+
+def orientation_inputs(flight: Flight) -> dict[str, object]:
+    """Return the values in flight.toml on which poses by static targets depend, by key."""
+    static = flight.static_targets
+    rings = {ring.name for target in static if isinstance(target, Target) for ring in target.rings}
+    names = rings | {target.name for target in static}
+    values: dict[str, object] = {"crs": flight.crs}
+    for key, value in detection_inputs(flight).items():
+        of_camera = key.startswith("[camera]") and not key.startswith(_CAMERA_ACCURACIES)
+        if of_camera or key.removeprefix(f"{TARGET_TABLE} ").rpartition(" ")[0] in names:
+            values[key] = value
+    for target in static:
+        values[f"{TARGET_TABLE} {target.name} position_m"] = target.position_m
+        values[f"{TARGET_TABLE} {target.name} sd_position_m"] = target.sd_position_m
+    return values
+
+
 def _plain_table(target: PlainTarget) -> dict[str, object]:
     """Return the keys of a target without a code, which its position distinguishes from others."""
     outer_m, *inner_m = target.diameters_m
@@ -293,6 +324,11 @@ def digest(value: object) -> str:
     """Return a digest of plain values: 32 hexadecimal digits."""
     text = json.dumps(value, sort_keys=True, default=str)  # `str` is for dates
     return hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]
+
+
+def content_digest(content: bytes) -> str:
+    """Return a digest of a file's content: 32 hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()[:_DIGITS]
 
 
 def _digest_of_file(path: Path) -> str | None:

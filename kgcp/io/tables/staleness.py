@@ -21,21 +21,26 @@ from kgcp.io.files.time_text import format_time
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.frame_times import FrameTimes
-from kgcp.io.images.frames import is_chosen, list_frames
+from kgcp.io.images.frames import RESULTS_NAME, is_chosen, list_frames
 from kgcp.io.images.remote import stamps_of
 from kgcp.io.tables.provenance import (
     TARGET_TABLE,
+    content_digest,
     content_sample,
     detection_inputs,
     digest,
     digested_times,
+    orientation_inputs,
 )
 from kgcp.measurement.records import TimeSource
-from kgcp.quality.number_text import counted
+from kgcp.quality.number_text import counted, listed
 from kgcp.settings import DetectSettings
 
 if TYPE_CHECKING:  # 0.3 s that `kgcp detect` does not need
     import pandas as pd
+
+POSES_TABLE = "poses.parquet"
+"""File name of the table that `kgcp orient` writes beside `poses.csv`."""
 
 _TIME_TOLERANCE_S = 2e-6  # as tables hold microseconds
 _SHIFT_TOLERANCE_S = 1e-3  # range of time changes that are reported as one shift
@@ -104,6 +109,37 @@ def require_current(path: Path, table: pd.DataFrame, flight: Flight) -> None:
         raise _outdated(path, flight, changes, _json(metadata, b"kgcp.settings"))
 
 
+def changed_since_orient(poses: Path, flight: Flight) -> list[str]:
+    """Return what has changed in flight.toml since `kgcp orient` wrote reference poses.
+
+    Poses that another program wrote depend on nothing in flight.toml. Those of `kgcp orient` are
+    recognised by the table beside them, or in the flight's results, which states their digest.
+
+    Parameters
+    ----------
+    poses : Path
+        File of the reference poses.
+    """
+    try:
+        found = content_digest(poses.read_bytes()).encode()
+    except OSError:  # reported where the poses are read
+        return []
+    for folder in (poses.parent, flight.folder / RESULTS_NAME):
+        try:
+            metadata = pq.read_schema(folder / POSES_TABLE).metadata or {}
+        except (OSError, pa.ArrowException):  # no table, or a damaged one
+            continue
+        if metadata.get(b"kgcp.poses_csv") == found:
+            then = _json(metadata, b"kgcp.orientation_inputs")
+            return [*_changed_keys(then, orientation_inputs(flight))]
+    return []
+
+
+def shown(changes: Sequence[str]) -> str:
+    """Return changes in a row; if there are many, some are only counted."""
+    return listed(changes, _MAX_CHANGES_SHOWN)
+
+
 def _check_times_alone(path: Path, table: pd.DataFrame, flight: Flight) -> None:
     """Refuse a table of pandas with times other than the flight's, and warn of what is unknown."""
     frames = table.drop_duplicates("frame")
@@ -125,13 +161,9 @@ def _check_times_alone(path: Path, table: pd.DataFrame, flight: Flight) -> None:
 def _outdated(
     path: Path, flight: Flight, changes: Sequence[str], settings: Mapping[str, object]
 ) -> KgcpError:
-    not_shown = len(changes) - _MAX_CHANGES_SHOWN
-    listed = ", ".join(
-        [*changes[:_MAX_CHANGES_SHOWN], *([f"{not_shown} more"] if not_shown > 0 else [])]
-    )
     return KgcpError(
         f"{path}: does not belong to this flight any more; changed since 'kgcp detect':"
-        f" {listed}; {_remedy(path, flight, settings)}"
+        f" {shown(changes)}; {_remedy(path, flight, settings)}"
     )
 
 

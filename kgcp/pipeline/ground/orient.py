@@ -12,7 +12,7 @@ import numpy as np
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera
-from kgcp.georef.crs import parse_crs
+from kgcp.georef.crs import is_geographic
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.sighting import Sighting, unmistakable
 from kgcp.georef.target_positions import TargetPosition, TargetPositions
@@ -30,7 +30,8 @@ from kgcp.io.tables.poses import (
     pose_residuals,
     poses_csv,
 )
-from kgcp.io.tables.provenance import derived_provenance
+from kgcp.io.tables.provenance import derived_provenance, orientation_provenance
+from kgcp.io.tables.staleness import POSES_TABLE
 from kgcp.network.ground.frame_poses import FramePose, orient_frames, print_scale_sd
 from kgcp.network.ground.position_check import WrongCamera, WrongPosition, wrong_input
 from kgcp.network.ground.resection import MIN_POINTS
@@ -331,13 +332,15 @@ def write_poses(poses: FlightPoses, folder: Path) -> tuple[Path, ...]:
     """
     rows = on_map(poses.poses, poses.local_frame)
     crs = poses.local_frame.crs
-    table, text = folder / "poses.parquet", folder / "poses.csv"
+    table, text = folder / POSES_TABLE, folder / "poses.csv"
+    content = poses_csv(rows, is_geographic=is_geographic(crs)).encode()
+    write_bytes(text, content)
     cells = (row_of(POSE_COLUMNS, row) for row in rows)
     about = {**poses.provenance, "crs": crs}
-    write_table(table, POSE_COLUMNS, cells, about)
+    write_table(
+        table, POSE_COLUMNS, cells, {**about, **orientation_provenance(poses.flight, content)}
+    )
     residuals = folder / "pose_residuals.parquet"
     cells = (row_of(POSE_RESIDUAL_COLUMNS, row) for row in pose_residuals(poses.poses))
     write_table(residuals, POSE_RESIDUAL_COLUMNS, cells, about)
-    is_geographic = bool(parse_crs(crs).is_geographic)
-    write_bytes(text, poses_csv(rows, is_geographic=is_geographic).encode())
     return table, residuals, text

@@ -37,6 +37,7 @@ from kgcp.network.ground.target_places import PlacedTarget, Placement, TargetMov
 from kgcp.network.ground.target_plane import MAX_EXTRA_PX
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.export import write_formats
+from kgcp.pipeline.flight_inputs import outdated_poses
 from kgcp.pipeline.frame_priors import motions_while_read
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.place_sentences import (
@@ -98,6 +99,8 @@ class FlightPlaces:
         The metadata of the tables.
     motions : CameraMotions or None
         Motions of the camera if it has a rolling shutter.
+    of_poses : tuple of str
+        Doubts about the file of the poses.
     """
 
     flight: Flight
@@ -106,6 +109,7 @@ class FlightPlaces:
     local_frame: LocalFrame
     provenance: Mapping[str, str]
     motions: CameraMotions | None = None
+    of_poses: tuple[str, ...] = ()
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -130,7 +134,7 @@ class FlightPlaces:
             noise_sentence(self.placement),
             motion_sentence(self.motions, self.flight.camera),
         )
-        return (*doubts, *(sentence for sentence in of_all if sentence))
+        return (*self.of_poses, *doubts, *(sentence for sentence in of_all if sentence))
 
     def gcps(self) -> tuple[Gcp, ...]:
         """Return a ground control point at the placed target for every sighting that took part."""
@@ -210,7 +214,10 @@ def place_flight(
         flight, table, choices, has_reference=options.poses is None and data.has_reference
     )
     used = _used_sightings(placement, sightings)
-    return FlightPlaces(flight, placement, used, local_frame, provenance, motions)
+    reference = flight.reference
+    file = options.poses or (None if reference is None else reference.file)
+    of_poses = () if file is None else tuple(map(str, outdated_poses(file, flight)))
+    return FlightPlaces(flight, placement, used, local_frame, provenance, motions, of_poses)
 
 
 def _require_fit(placement: Placement, flight: Flight, poses: Path | None) -> None:

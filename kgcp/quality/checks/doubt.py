@@ -95,7 +95,7 @@ class Cause(StrEnum):
         "several frames have the same time: they are copies, or times are in whole seconds",
     )
     FRAME_ORDER = "frame_order", "times or reference poses belong to the next or previous frame"
-    REFERENCE = "reference", "reference poses are of another place, or rotated"
+    REFERENCE = "reference", "reference poses are of another place, rotated, or outdated"
     STATIC_TARGETS = (
         "static_targets",
         "a static target is not at its position_m, as reference poses or the other targets show",
