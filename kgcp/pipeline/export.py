@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 
-from kgcp.errors import KgcpError, SettingError
+from kgcp.errors import KgcpError, KgcpWarning, SettingError
 from kgcp.georef.camera_priors import CameraPrior, camera_priors
 from kgcp.georef.gcp import Gcp, SkippedSighting, SkipReason, build_gcps, transform_gcps
 from kgcp.georef.local_frame import CrsTransform
@@ -35,6 +38,9 @@ from kgcp.quality.checks.doubt import Doubt, ranked
 from kgcp.quality.consistency import Consistency
 from kgcp.quality.number_text import rounded
 from kgcp.settings import require_kind
+
+POINTS_TABLE = "kgcps.parquet"
+"""File name of the points in the results folder."""
 
 _DEFAULT_SELECTION = Selection()
 
@@ -196,6 +202,9 @@ def export_gcps(
 ) -> list[Path]:
     """Write the files of some formats, and return their paths.
 
+    A `kgcps.parquet` of other points in the folder, from an earlier `kgcp export-gcp`, stays there,
+    with a `KgcpWarning`.
+
     Parameters
     ----------
     formats : sequence of str
@@ -224,7 +233,24 @@ def export_gcps(
         mark_floor_px,
         image_extensions,
     )
-    return write_formats(points, formats, folder)
+    written = write_formats(points, formats, folder)
+    _warn_of_other_points(folder / POINTS_TABLE, gcp_set)
+    return written
+
+
+def _warn_of_other_points(table: Path, gcp_set: GcpSet) -> None:
+    """Warn if there is a table of an earlier export that was made from other inputs."""
+    try:
+        metadata = pq.read_schema(table).metadata or {}
+    except (OSError, pa.ArrowException):  # no table, or a damaged one
+        return
+    if metadata.get(b"kgcp.digests", b"").decode() != gcp_set.provenance["digests"]:
+        warnings.warn(
+            f"{table}: is of an earlier export, made from other inputs than the files written now;"
+            " delete it, or repeat 'kgcp export-gcp'",
+            KgcpWarning,
+            stacklevel=4,  # the caller of `export_gcps`, which is decorated
+        )
 
 
 def write_formats(points: MapPoints, formats: Sequence[str], folder: Path) -> list[Path]:
@@ -253,7 +279,7 @@ def write_gcps(gcp_set: GcpSet, folder: Path) -> list[Path]:
         If a file cannot be written.
     """
     about = gcp_set.provenance
-    table = folder / "kgcps.parquet"
+    table = folder / POINTS_TABLE
     write_table(table, GCP_COLUMNS, map(gcp_row, gcp_set.gcps), {**about, "crs": gcp_set.crs})
     if gcp_set.consistency is None:
         remove_consistency(folder)

@@ -173,6 +173,15 @@ def test_programs_are_warned_of_exclusions_that_match_nothing(folder: Path) -> N
     assert [path.name for path in written] == ["kgcps.csv"]
 
 
+def test_programs_are_warned_of_a_table_of_other_points(folder: Path) -> None:
+    _export(folder)
+    results, flight = folder / "kgcp", read_flight(folder)
+    export_gcps(make_gcps(flight), ["csv"], results)  # the same points: warnings are errors here
+    with pytest.warns(KgcpWarning, match=r"kgcps.parquet: is of an earlier export") as warned:
+        export_gcps(make_gcps(flight, crs="EPSG:4258"), ["csv"], results)
+    assert Path(warned[0].filename).name == "test_export_options.py"
+
+
 def test_no_page_says_that_a_doubted_flight_needs_no_correction(folder: Path) -> None:
     toml = (folder / "flight.toml").read_text(encoding="utf-8")
     right = toml.replace("lever_arm_m", f"time_offset_s = {_LATE_S}\nlever_arm_m")
