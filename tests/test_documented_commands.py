@@ -18,7 +18,7 @@ from kgcp.cli import COMMANDS, main
 from kgcp.io.flight.flight import read_flight
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 # Runs of bare folders, which tests/benchmarks/test_first_flight.py repeats.
 FIRST_FLIGHTS = {"first_flight.md", "first_flight_runs.md"}
 FRAMES = ("frame_0002.jpg", "frame_0006.jpg", "frame_0011.jpg", "frame_0015.jpg")

@@ -4,9 +4,9 @@
 
 The methods are the grey-weighted centroid above a threshold (as in Australis), the target function
 of Otepka & Fraser (2004), and kgcp's image model. Each measures the same rendered photographs of
-dark and of bright discs. The output is the table of docs/method.md: the RMS of the centre's errors
-divided by the Cramér-Rao bound, and the mean error along the light's gradient [px], of dark or of
-bright discs, whichever is larger.
+dark and of bright discs. The output is the table of docs/method/discs.md: the RMS of the centre's
+errors divided by the Cramér-Rao bound, and the mean error along the light's gradient [px], of dark
+or of bright discs, whichever is larger.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from kgcp.georef.trajectory import Motion, spline_knots
 _SPLINE_ORDER, _TURN_ORDER = 4, 2
 # Factor on the estimated errors. In simulated drives at 1 Hz the steps are too long for the powers
 # above: errors of attitudes are 1/4 to 1/3 of the misfits instead of 1/4, those of positions 1/30
-# to 1/6 instead of 1/16 (docs/method.md, "Points").
+# to 1/6 instead of 1/16 (docs/method/points.md, "Points").
 _MARGIN = 4.0 / 3.0
 # Epochs around an interval, counted from the one before it. The misfits of four are averaged,
 # because a single one may be small by chance.

@@ -21,8 +21,8 @@ from kgcp.measurement.search.template_match import match_templates, polar_patch
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
 
-# Tuning of the second look. Its benchmark is the table in docs/method.md, "The second pass": four
-# simulated flights, with the targets that the second look adds.
+# Tuning of the second look. Its benchmark is the table in docs/method/search.md, "The second pass":
+# four simulated flights, with the targets that the second look adds.
 _SIGMAS = 4.0  # largest deviation from the prediction, in place and radius
 _SMALLEST_PX = 3.0  # least radius of a ring that is looked for
 _FARTHEST = 8.0  # largest deviation of the place in radii at which a prediction is of use

@@ -4,8 +4,7 @@ An unknown tone curve is modelled as a modification of a known curve, its base. 
 in each frame. A single frame may prefer the wrong one, but all frames come from one camera;
 therefore their log-likelihoods are added. For a given base, each frame keeps its own tone and
 sharpening, because knowing them beforehand would improve distances by only 2 % of their standard
-deviations. Smoothing along contours is learnt from all frames (docs/method.md, "What a flight
-shares").
+deviations. Smoothing along contours is learnt from all frames (docs/method/shared_imaging.md).
 """
 
 from __future__ import annotations

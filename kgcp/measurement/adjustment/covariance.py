@@ -61,8 +61,8 @@ _SIMD_WIDTH = 4  # numbers that the processor takes at once
 _EDGE_FLOOR_PX, _EDGE_FLOOR_OF_BINS_PX = 0.0005, 0.004
 # Levels that vary may imitate the halos of sharpening. Simulated sets of 23 to 40 rings of R ≥ 26
 # px, sharpened with strengths of 0.5 to 0.8, were too large or too small by up to 0.0015 px in the
-# mean (docs/method.md, "Halos of sharpening"). So this times the strength counts as such a
-# displacement.
+# mean (docs/method/covariance.md, "Halos of sharpening"). So this times the strength counts as such
+# a displacement.
 _PER_SHARPENING_PX = 0.003
 # Factors of the variances on small rings, whose residuals do not show enough of uneven light: where
 # levels vary, and at most where they do not. Without them, z was 1.4 in shade and 1.5 with dirt

@@ -72,7 +72,8 @@ _NOTHING_KNOWN = PlatePrior()
 # Of 480 simulated plates in uneven light, three have more, all under highlights; one of them was
 # 4.1 σ off.
 _UNEXPLAINED_INFLATION = 8.0
-_SHARPENING_PX = 1.2  # usual in cameras; 0.7 to 1.7 change little (docs/method.md, "Light")
+# usual in cameras; 0.7 to 1.7 change little (docs/method/image_model.md, "Light")
+_SHARPENING_PX = 1.2
 
 
 def measure_by_model(

@@ -3,7 +3,7 @@
 Both are found before the adjustment, with an approximate pose, blur and light: they are where grey
 values cannot be those of the plate. All pixels that blur may have mixed with them are left out,
 too. The rules are local and rather leave out too much: that costs a little accuracy, while leaving
-out too little biases the distance. docs/method.md, "Masks", derives them.
+out too little biases the distance. docs/method/adjustment.md, "Masks", derives them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Levels of ink and plate that vary over the plate, adjusted with pose, blur and light.
 
 They are random effects: values at knots, with a prior of zero mean whose variance is estimated from
-the frame itself. docs/method.md, "Light that is not the same everywhere", says why.
+the frame itself. docs/method/uneven_light.md says why.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from kgcp.measurement.image_model.ray_plate import plate_views
 from kgcp.measurement.records import ContourSmoothing, Measurement
 
 # In eight flights rendered by other programs, the smoothing had means of −0.07 to 0.09 px², with
-# scatters of 0 to 0.08 px² about them (docs/method.md, "What a flight shares").
+# scatters of 0 to 0.08 px² about them (docs/method/shared_imaging.md, "Smoothing along contours").
 _SD_OF_CAMERAS_PX2, _SCATTER_PX2 = 0.1, 0.05
 # A circle's growth beyond this is no small unknown: one step does not reach it.
 _LARGEST_GROWTH = 0.3

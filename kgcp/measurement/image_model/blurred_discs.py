@@ -2,7 +2,7 @@
 
 A pixel sees the integral over a disc of the point spread, which is an anisotropic Gaussian
 convolved with a motion. Over two dimensions it has no closed form. Along one direction it has;
-along the other there are two rules (docs/method.md, "Blurred discs", derives both):
+along the other there are two rules (docs/method/image_model.md, "Blurred discs", derives both):
 
 - If a disc is large compared with the blur, its edge is a parabola within the blur. The mean over
   that is a straight edge that is displaced, widened and skewed (`_add_straight`).

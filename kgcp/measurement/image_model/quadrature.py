@@ -3,8 +3,8 @@
 The radii up to which each rule is used were found by comparison with the noncentral χ² distribution
 (isotropic blur) and with 70 chords (anisotropic blur). The error of any number of chords is below
 3e-4 of the contrast, and so is that of the closed form if the blur is isotropic. Otherwise the
-closed form is off by up to 6e-4, under streaks of up to 8 px by 2e-3 (docs/method.md, "Blurred
-discs"). tests/measurement/image_model/test_blurred_discs.py repeats the comparison.
+closed form is off by up to 6e-4, under streaks of up to 8 px by 2e-3 (docs/method/image_model.md,
+"Blurred discs"). tests/measurement/image_model/test_blurred_discs.py repeats the comparison.
 """
 
 from __future__ import annotations

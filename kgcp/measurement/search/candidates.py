@@ -22,7 +22,7 @@ from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Ring
 
 # Tuning of the candidates. There are two benchmarks: `benchmarks.search.hard_frames` for the
-# targets found (results in docs/method.md, "Constants of the search"), and
+# targets found (results in docs/method/search.md, "Constants of the search"), and
 # `benchmarks.search.false_alarms`.
 _MIN_CONTRAST = 0.02  # relative to the frame's white
 _MIN_DOT_CONTRAST = 0.1  # relative to the ring's contrast; blur may leave so little of the dots

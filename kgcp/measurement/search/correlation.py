@@ -1,8 +1,8 @@
 """Masked normalised cross-correlation of polar patches with polar templates, at all rotations.
 
 The same score is used for whole rings, for partly hidden rings, and for code circles alone;
-docs/method.md, "The code", derives it. With ⟨…⟩ the mean over the visible samples, weighted by row,
-the score of a template i against a patch p is
+docs/method/search.md, "The code", derives it. With ⟨…⟩ the mean over the visible samples, weighted
+by row, the score of a template i against a patch p is
 
     (⟨i p⟩ − ⟨i⟩⟨p⟩) / √((⟨i²⟩ − ⟨i⟩²) (⟨p²⟩ − ⟨p⟩²))
 

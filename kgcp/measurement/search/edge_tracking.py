@@ -4,7 +4,7 @@ The outer edge is where the grey values increase most on the way outwards. On a 
 also be the rim of a dot, a shadow or clutter. Over all rays, however, the edge of a ring is a
 smooth closed curve: an ellipse that is slightly off the seed's centre and slightly elongated has,
 to first order, the distances that `harmonic_curves` models with five parameters. A robust linear
-fit of these separates the edge from the rest. docs/method.md, "Edge tracking", derives it.
+fit of these separates the edge from the rest. docs/method/search.md, "Edge tracking", derives it.
 Afterwards `fit_ellipses` fits the exact ellipse to the edge points that remain.
 """
 
@@ -21,8 +21,8 @@ from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
 from kgcp.measurement.search.harmonic_curves import TERMS, fill_in_medians, fit_curves, waves_of
 
 # Tuning of the tracking. Lengths are relative to the seed's radius, which is accurate to a fifth.
-# The benchmark is `benchmarks.search.hard_frames`; docs/method.md, "Constants of the search", has
-# its results with other values.
+# The benchmark is `benchmarks.search.hard_frames`; docs/method/search.md, "Constants of the
+# search", has its results with other values.
 # Tracking has two stages. The first uses every second ray and whole pixels: most seeds are not
 # rings, and half of the rays is enough to see that. The second uses all rays, near the first curve.
 RAYS = 40  # a ring of 6 px radius has about as many pixels along its edge

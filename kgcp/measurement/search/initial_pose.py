@@ -1,6 +1,6 @@
 """The pose from which the adjustment starts, for a ring with the right code.
 
-docs/method.md, "The start", describes the method.
+docs/method/search.md, "The start", describes the method.
 """
 
 from __future__ import annotations

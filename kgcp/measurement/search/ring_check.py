@@ -7,7 +7,7 @@ those on core and surround must not vary more than shade explains.
 
 Order statistics are used instead of means. Dots brighten parts of the ring, and objects may hide a
 part of any circle. That changes means and largest values, but not values of lower rank.
-docs/method.md, "Ring check", lists the ranks.
+docs/method/search.md, "Ring check", lists the ranks.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 from kgcp.measurement.search.pyramid import Pyramid
 from kgcp.measurement.search.ring_filter import PEAK_RADIUS_PX
 
-# Tuning of the check. The benchmark is `benchmarks.search.hard_frames`; docs/method.md, "Constants
-# of the search", has its results with other values.
+# Tuning of the check. The benchmark is `benchmarks.search.hard_frames`; docs/method/search.md,
+# "Constants of the search", has its results with other values.
 # The sampled circles: their numbers, and their radii relative to the outer one. The surround is
 # sampled on a near and on a far circle. The circle of the core lies outside a replica.
 _RATIOS = np.array((0.76, 1.15, 1.34, 0.33))

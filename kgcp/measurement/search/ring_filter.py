@@ -7,8 +7,8 @@ weight towards the corners. The score is
     core − disc + surround − disc
 
 It is large where a disc is darker than both its core and its surround, and 0 on planes and in the
-middle of edges. docs/method.md, "Ring filter", lists the response by radius. Larger rings are found
-in reduced images.
+middle of edges. docs/method/search.md, "Ring filter", lists the response by radius. Larger rings
+are found in reduced images.
 
 The code is written for speed: the filters pass through an image row by row, in strips. Every loop
 is over one row of small integers, which is vectorised, and all intermediate results stay in the
@@ -24,8 +24,8 @@ from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 
 # Tuning of the filter. It has two benchmarks: `benchmarks.search.hard_frames` for the targets found
-# (results in docs/method.md, "Constants of the search"), and `benchmarks.speed.relative_costs` for
-# the time that more peaks take in later stages.
+# (results in docs/method/search.md, "Constants of the search"), and
+# `benchmarks.speed.relative_costs` for the time that more peaks take in later stages.
 PEAK_RADIUS_PX = 2.8
 """Ring radius that a peak stands for; the check tries 0.76 to 1.21 times this radius."""
 _UNIT = 225.0 / 4.0  # score per grey value: 225 pixels; only a quarter of it fits into 16 bits

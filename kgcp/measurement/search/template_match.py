@@ -33,7 +33,7 @@ from kgcp.measurement.search.uneven_light import MIN_CORRECTED_RADIUS_PX, light_
 from kgcp.targets.layout import Ring
 
 # Tuning of the comparison. There are two benchmarks: `benchmarks.search.hard_frames` for the
-# targets found (results in docs/method.md, "Constants of the search"), and
+# targets found (results in docs/method/search.md, "Constants of the search"), and
 # `benchmarks.search.false_alarms`.
 MIN_SCORE_OF_A_CODE = 0.7
 """Score above which a ring with dots carries some code, though perhaps another one."""

@@ -11,7 +11,7 @@ from kgcp.geometry.arrays import FloatArray, SingleArray
 from kgcp.measurement.search.correlation import TemplateBank, build_bank
 from kgcp.targets.layout import Ring
 
-# Tuning of the templates. The benchmark is `benchmarks.search.hard_frames`; docs/method.md,
+# Tuning of the templates. The benchmark is `benchmarks.search.hard_frames`; docs/method/search.md,
 # "Constants of the search", has its results with fewer templates and shifts.
 # Each template has a blur (σ of the edges, relative to the outer radius) and an exposure: the level
 # between black, 0, and white, 1, at which it is clipped.

@@ -106,7 +106,7 @@ def by_chords(disc: Disc, x: FloatArray, y: FloatArray, count: int) -> FloatArra
 
 
 def by_parabola(disc: Disc, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Level of a disc by the closed form for an edge that is a parabola (docs/method.md)."""
+    """Level of a disc with a parabola for an edge, by the formula in docs/method/image_model.md."""
     rho, radius = np.hypot(x, y), disc.radius
     u, v = x / rho, y / rho
     radial, across, mixed = along_and_across(disc, u, v)
@@ -172,7 +172,8 @@ def test_every_rule_approximates_its_integral(
 ) -> None:
     disc = some_disc(radius, blur, streak)
     x, y = around(radius, 4.0 + 0.5 * float(np.hypot(*streak)), 41)
-    tolerance = 3e-3 if disc.rule is Quadrature.EDGE else 3e-4  # docs/method.md, "Blurred discs"
+    # docs/method/image_model.md, "Blurred discs"
+    tolerance = 3e-3 if disc.rule is Quadrature.EDGE else 3e-4
     assert np.abs(disc.level(x, y) - by_chords(disc, x, y, 900)).max() < tolerance
 
 
