@@ -94,6 +94,7 @@ CASES = {
         ToneCurve.FILM, Response.UNKNOWN, 2.5, gain=1.5 / _BRIGHT, quality=92
     ),
     "consumer": Case(ToneCurve.FILM, Response.UNKNOWN, 2.5, sharpening=0.5, quality=92),
+    "consumer_srgb": Case(ToneCurve.SRGB, Response.UNKNOWN, 2.5, sharpening=0.5, quality=92),
     "defocused": Case(ToneCurve.LINEAR, Response.LINEAR, 1.15, defocus_px=2.0),
     "defocused_clipped": Case(
         ToneCurve.LINEAR, Response.LINEAR, 1.6, gain=1.5 / _BRIGHT, defocus_px=2.0
