@@ -224,7 +224,7 @@ def _turned_overlap(codes: FloatArray, width_deg: float) -> FloatArray:
     for i, j in itertools.product(range(codes.shape[1]), repeat=2):
         overlap += _share((codes[:, j] - codes[:, i])[:, None] - turns, width_deg)
     overlap[np.abs((turns + 180.0) % 360.0 - 180.0) < width_deg] = 0.0
-    return np.asarray(overlap.max(axis=1))
+    return np.asarray(overlap.max(axis=1, initial=0.0))  # a single dot has no such rotation
 
 
 def _apart(codes: FloatArray, other: FloatArray, width_deg: float) -> FloatArray:

@@ -70,6 +70,7 @@ def test_symmetric_codes_are_near_to_themselves() -> None:
     assert dots_apart_turned(ring(0, 180)) == pytest.approx(0.0, abs=1e-9)
     # A half turn lays 0 and 180 onto each other, and nothing else.
     assert dots_apart_turned(ring(0, 43, 78, 180)) == pytest.approx(4.0)
+    assert dots_apart_turned(ring(0)) == 2.0  # no rotation lays a single dot onto another
 
 
 def test_proposed_codes_are_the_farthest_of_all() -> None:
