@@ -241,7 +241,7 @@ class FlightInputs:
             *check_camera(flight.camera, is_guessed=flight.is_camera_guessed),
             *check_plates(flight.all_targets),
             *check_target_deviations(flight.all_targets),
-            *check_frames(self.headers, flight.camera),
+            *check_frames(self.headers, flight.camera, flight.exif_camera),
             *self._doubts_of_places(),
             *self._doubts_of_times(),
         ]

@@ -21,10 +21,12 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.io.flight.camera_table import read_camera_file
-from kgcp.io.flight.flight import read_camera_and_targets
+from kgcp.io.flight.flight import read_camera_and_targets, read_flight
 from kgcp.io.formats.camera_writers import CAMERA_FORMATS, CalibratedCamera, camera_file
 from kgcp.measurement.discs.records import Operator
 from kgcp.network.calibration_records import LensModel, PointModel
+from kgcp.pipeline.check import doubts_before_detecting
+from kgcp.quality.checks.doubt import Cause
 from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, photograph
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.targets.fields.layout import Field, GridKind, Mark
@@ -103,7 +105,14 @@ def take_photographs(folder: Path, camera: Camera) -> None:
         grey = photograph(
             camera, Pose(rotation, shift - rotation @ middle), scene, Optics(0.6), sensor, rng
         )
-        cv2.imwrite(str(folder / f"photo{index + 1}.png"), grey)
+        Image.fromarray(grey).save(folder / f"photo{index + 1}.png", exif=exif_of(24.0))
+
+
+def exif_of(focal_mm: float) -> Image.Exif:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "Maker", "M1"
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLength] = focal_mm
+    return exif
 
 
 @pytest.fixture(scope="module")
@@ -184,6 +193,19 @@ def test_flight_toml_takes_the_camera_with_its_covariance(
     (tmp_path / "flight.toml").write_text(toml.replace("[camera]", "[camera]\nwidth = 400"))
     with pytest.raises(KgcpError, match="width: is given beside a camera"):
         read_camera_and_targets(tmp_path)
+
+
+@pytest.mark.parametrize(("focal_mm", "codes"), [(24.4, []), (28.0, [Cause.OTHER_CAMERA])])
+def test_a_flight_with_another_zoom_is_doubted(
+    calibration: tuple[Path, Result], tmp_path: Path, focal_mm: float, codes: list[Cause]
+) -> None:
+    """The focus may change the focal length a little."""
+    shutil.copy(calibration[0] / "camera.toml", tmp_path)
+    (tmp_path / "flight.toml").write_text(f'[camera]\nfile = "camera.toml"\n{TARGET_TOML}')
+    (tmp_path / "frames").mkdir()
+    frame = Image.new("L", (CAMERA.width, CAMERA.height))
+    frame.save(tmp_path / "frames" / "1.jpg", exif=exif_of(focal_mm))
+    assert [doubt.code for doubt in doubts_before_detecting(read_flight(tmp_path))] == codes
 
 
 @pytest.mark.usefixtures("_no_figures")
@@ -378,11 +400,8 @@ def test_too_few_photographs_of_one_size_are_explained_by_their_sizes(
 
 def test_two_focal_lengths_are_two_cameras(photos: Path, tmp_path: Path) -> None:
     for index, focal in ((1, 24.0), (2, 35.0)):
-        exif = Image.Exif()
-        exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "Maker", "M1"
-        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLength] = focal
         with Image.open(photos / f"photo{index}.png") as image:
-            image.save(tmp_path / f"{index}.jpg", quality=98, exif=exif)
+            image.save(tmp_path / f"{index}.jpg", quality=98, exif=exif_of(focal))
     field, out = photos / "field.toml", tmp_path / "out"
     result = run(tmp_path, "--field", field, "--out", out, *QUIET)
     assert result.exit_code == 1

@@ -8,9 +8,15 @@ import numpy as np
 
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, CalibrationCovariance
 from kgcp.geometry.camera import Camera
+from kgcp.io.flight.toml_draft import toml_text
+from kgcp.quality.checks.frame_header import ExifCamera
 
 
-def camera_toml(camera: Camera, covariance: CalibrationCovariance | None) -> str:
+def camera_toml(
+    camera: Camera,
+    covariance: CalibrationCovariance | None,
+    by_exif: ExifCamera | None = None,
+) -> str:
     """Return the text of a camera.toml, whose numbers are read back to the last bit.
 
     Without a covariance it says nothing about how well the camera is known.
@@ -23,6 +29,7 @@ def camera_toml(camera: Camera, covariance: CalibrationCovariance | None) -> str
         '#     format = "kgcp"',
         "",
         *camera_lines(camera),
+        *_exif_lines(by_exif or ExifCamera()),
     ]
     if covariance is None:
         return "\n".join(lines) + "\n"
@@ -45,3 +52,13 @@ def camera_lines(camera: Camera) -> Iterator[str]:
         if name in CALIBRATION_PARAMETERS[:4] or value != 0.0:
             yield f"{name} = {value!r}"
     yield f'response = "{camera.response.value}"'
+
+
+def _exif_lines(camera: ExifCamera) -> Iterator[str]:
+    """Yield what EXIF says about the camera, where it says something."""
+    if camera.name:
+        yield f"exif_camera = {toml_text(camera.name)}"
+    if camera.focal_mm is not None:
+        yield f"exif_focal_mm = {toml_text(camera.focal_mm)}"
+    if camera.focal_35_mm is not None:
+        yield f"exif_focal_35_mm = {toml_text(camera.focal_35_mm)}"

@@ -13,6 +13,7 @@ from kgcp.geometry.camera import Camera, Response, TimeReference
 from kgcp.io.flight.toml_file import read_toml
 from kgcp.io.flight.toml_table import TomlTable
 from kgcp.io.formats.calibrations import FORMATS, read_calibration
+from kgcp.quality.checks.frame_header import ExifCamera
 from kgcp.settings import require_range
 
 _NEEDED = ("fx", "fy", "cx", "cy")  # what has no default
@@ -26,7 +27,11 @@ CAMERA_KEYS = (
 
 OWN_FORMAT = "kgcp"
 """Of a camera.toml, as `kgcp calibrate` writes it."""
-OWN_KEYS = ("width", "height", *CALIBRATION_PARAMETERS, "response", "cov_of", "cov")
+_EXIF_KEYS = ("exif_camera", "exif_focal_mm", "exif_focal_35_mm")
+OWN_KEYS = (
+    *("width", "height", *CALIBRATION_PARAMETERS, "response", "cov_of", "cov"),
+    *_EXIF_KEYS,
+)
 _FORMATS = (OWN_FORMAT, *FORMATS.names)
 # Distances follow from them; a ring's from the one along which its image is longest.
 _BOTH = "state how well fx and fy are known, both: what is not stated counts as exact"
@@ -147,6 +152,23 @@ def read_calibration_covariance(table: TomlTable, folder: Path) -> CalibrationCo
             require_range(key, float(value), 0.0, 1e4)
         names = tuple(key.removeprefix("sd_") for key in deviations)
         return CalibrationCovariance.of(names, np.diag(sd**2))
+
+
+def read_exif_camera(table: TomlTable, folder: Path) -> ExifCamera:
+    """Return the camera by EXIF of the photographs that the named camera.toml was made from.
+
+    Raises
+    ------
+    KgcpError
+        Naming file, key and remedy.
+    """
+    own = _own_table(table, folder)
+    if own is None:
+        return ExifCamera()
+    name, *focals_mm = _EXIF_KEYS
+    return ExifCamera(
+        own.optional(name, own.text) or "", *(own.optional(key, own.number) for key in focals_mm)
+    )
 
 
 def read_plumb_sd_deg(table: TomlTable) -> float | None:

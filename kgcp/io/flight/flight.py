@@ -15,6 +15,7 @@ from kgcp.io.flight.camera_table import (
     CAMERA_KEYS,
     read_calibration_covariance,
     read_camera,
+    read_exif_camera,
     read_plumb_sd_deg,
 )
 from kgcp.io.flight.target_table import read_plain_targets, read_targets
@@ -24,6 +25,7 @@ from kgcp.io.flight.vehicle_table import VehicleTable, read_vehicle
 from kgcp.io.formats.frame_times import FORMATS as TIMES_FORMATS
 from kgcp.io.formats.orientations import FORMATS as POSE_FORMATS
 from kgcp.io.formats.orientations.records import OrientationFileOptions
+from kgcp.quality.checks.frame_header import ExifCamera
 from kgcp.settings import require_kind
 from kgcp.targets.layout import Target
 from kgcp.targets.plain import AnyTarget, PlainTarget
@@ -60,6 +62,8 @@ class Flight:
         Whether EXIF gives the time of a frame that the times file, if there is one, does not name.
     calibration_covariance : CalibrationCovariance or None
         How well the camera is calibrated; None: flight.toml does not say.
+    exif_camera : ExifCamera
+        The camera by EXIF of the photographs that it was calibrated from.
     is_camera_guessed : bool
         Whether the camera is only a guess, as `kgcp init` makes it from EXIF.
     plumb_sd_deg : float or None
@@ -80,6 +84,7 @@ class Flight:
     may_use_exif_times: bool
     camera: Camera
     calibration_covariance: CalibrationCovariance | None
+    exif_camera: ExifCamera
     is_camera_guessed: bool
     plumb_sd_deg: float | None
     targets: tuple[Target, ...]
@@ -132,6 +137,7 @@ def read_flight(folder: Path | str) -> Flight:
         may_use_exif_times=times_file is None or exif_fallback,
         camera=read_camera(camera, folder),
         calibration_covariance=read_calibration_covariance(camera, folder),
+        exif_camera=read_exif_camera(camera, folder),
         is_camera_guessed=camera.boolean("guessed", default=False),
         plumb_sd_deg=plumb_sd_deg,
         targets=targets,

@@ -17,6 +17,7 @@ import numpy as np
 from kgcp.errors import KgcpError, KgcpWarning, Reason
 from kgcp.geometry.camera import Response
 from kgcp.io.files.safe_read import is_file, is_folder
+from kgcp.io.images.exif import read_frame_header
 from kgcp.io.images.frames import FRAME_SUFFIXES, kind_of, list_frames
 from kgcp.io.images.remote import stamps_of
 from kgcp.io.tables.provenance import versions
@@ -43,6 +44,7 @@ from kgcp.pipeline.execution.executor import WorkerPool, open_pool
 from kgcp.pipeline.execution.journal import Journal, fingerprint
 from kgcp.pipeline.execution.resilient_map import TaskFailure
 from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.quality.checks.frame_header import ExifCamera
 from kgcp.targets.fields.naming import NamingProblem
 from kgcp.targets.fields.points import AnyField
 
@@ -130,6 +132,7 @@ class PhotoCalibration:
     discs: Mapping[str, PhotoDiscs]  # of the photographs that took part
     misses: tuple[PhotoMiss, ...]  # the others
     photos: tuple[str, ...]  # all, in order
+    exif_camera: ExifCamera  # of the photographs that took part
 
 
 def find_photos(places: Sequence[Path]) -> list[Photo]:
@@ -483,4 +486,7 @@ def _outcome(
             size = (result.width, result.height)
             misses.append(PhotoMiss(result.photo, *size, UNLIKE_FIELD, ""))
     names = tuple(photo.name for photo in photos)
-    return PhotoCalibration(field, options, calibration, discs, tuple(misses), names)
+    exif = ExifCamera.of(
+        [read_frame_header(photo.path, photo.name) for photo in photos if photo.name in discs]
+    )
+    return PhotoCalibration(field, options, calibration, discs, tuple(misses), names, exif)

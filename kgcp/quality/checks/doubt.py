@@ -47,6 +47,10 @@ class Cause(StrEnum):
         "calibration_size",
         "the calibration is of frames of half, double or another size",
     )
+    OTHER_CAMERA = (
+        "other_camera",
+        "the calibration is of another camera, zoom or crop than the frames, by EXIF",
+    )
     GUESSED_CAMERA = "guessed_camera", "the camera is a guess from EXIF, not a calibration"
     DISTORTION_SIGN = "distortion_sign", "k1, k2 … have the sign of another distortion model"
     DISTORTION = (

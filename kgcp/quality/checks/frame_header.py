@@ -18,6 +18,7 @@ _SMALL_FORMAT_MM = 36.0, math.hypot(36.0, 24.0)  # width and diagonal; equivalen
 _FOCAL_TOLERANCE = 1.25
 _SIZE_TOLERANCE = 1.1  # the same about half and double size
 _FOCUS_FACTOR = 1.03  # by which focusing changes a focal length in EXIF
+_ROUNDING_35_MM = 1.0  # difference of two equivalents that are rounded to whole millimetres
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,11 +40,56 @@ class FrameHeader:
     altitude_m: float | None = None  # above the take-off point
 
 
-def check_frames(headers: Sequence[FrameHeader], camera: Camera) -> Iterator[Doubt]:
-    """Compare sizes, makers and focal lengths of the frames with each other and the camera."""
+@dataclass(frozen=True, slots=True)
+class ExifCamera:
+    """What EXIF says about the camera that took the photographs of a calibration."""
+
+    name: str = ""  # maker, model and serial number; empty: not known
+    focal_mm: float | None = None
+    focal_35_mm: float | None = None
+
+    @classmethod
+    def of(cls, headers: Sequence[FrameHeader]) -> ExifCamera:
+        """Return what all headers that state it agree on."""
+        names = {header.camera for header in headers if header.camera.isprintable()} - {""}
+        focals_mm = {header.focal_mm for header in headers} - {None}
+        focals_35_mm = {header.focal_35_mm for header in headers} - {None}
+        return cls(
+            names.pop() if len(names) == 1 else "",
+            focals_mm.pop() if len(focals_mm) == 1 else None,
+            focals_35_mm.pop() if len(focals_35_mm) == 1 else None,
+        )
+
+    def difference(self, header: FrameHeader) -> tuple[str, str]:
+        """Return what another camera, zoom or crop is here and in a frame; empty: no difference."""
+        own, other = self.name.casefold(), header.camera.casefold()
+        if own and other and not (own.startswith(other) or other.startswith(own)):
+            return self.name, header.camera  # either may lack the serial number
+        for own_mm, other_mm, rounding_mm, kind in (
+            (self.focal_mm, header.focal_mm, 0.0, ""),
+            (self.focal_35_mm, header.focal_35_mm, _ROUNDING_35_MM, " (35 mm equivalent)"),
+        ):
+            if own_mm is None or other_mm is None:
+                continue
+            if max(own_mm, other_mm) > _FOCUS_FACTOR * min(own_mm, other_mm) + rounding_mm:
+                return f"{own_mm:g} mm{kind}", f"{other_mm:g} mm{kind}"
+        return "", ""
+
+
+def check_frames(
+    headers: Sequence[FrameHeader], camera: Camera, calibrated: ExifCamera | None = None
+) -> Iterator[Doubt]:
+    """Compare sizes, makers and focal lengths of the frames with each other and the camera.
+
+    Parameters
+    ----------
+    calibrated : ExifCamera, optional
+        The camera by the photographs of its calibration.
+    """
     yield from _check_sizes(headers, camera)
     yield from _check_cameras(headers)
     yield from _check_focal_length(headers, camera)
+    yield from _check_calibrated(headers, calibrated or ExifCamera())
 
 
 def _check_sizes(headers: Sequence[FrameHeader], camera: Camera) -> Iterator[Doubt]:
@@ -144,3 +190,20 @@ def _check_focal_length(headers: Sequence[FrameHeader], camera: Camera) -> Itera
             )
             return
     yield mild(Cause.FOCAL_LENGTH, sentence, "give fx and fy of this camera and zoom", figures)
+
+
+def _check_calibrated(headers: Sequence[FrameHeader], calibrated: ExifCamera) -> Iterator[Doubt]:
+    differences = [(header.frame, *calibrated.difference(header)) for header in headers]
+    others = [difference for difference in differences if any(difference[1:])]
+    if not others:
+        return
+    frame, own, other = others[0]
+    doubt = grave if 10 * len(others) > len(headers) else mild
+    yield doubt(
+        Cause.OTHER_CAMERA,
+        f"by EXIF, the photographs of the calibration are by {own}, but {len(others)} of"
+        f" {len(headers)} frames are not: {frame} is by {other}",
+        "calibrate the camera of the frames with the zoom and crop of the flight; if it is the"
+        " same, delete the keys exif_… in camera.toml",
+        {"frames": float(len(others))},
+    )

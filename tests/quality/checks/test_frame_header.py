@@ -6,7 +6,7 @@ import pytest
 
 from kgcp.geometry.camera import Camera
 from kgcp.quality.checks.doubt import Cause
-from kgcp.quality.checks.frame_header import FrameHeader, check_frames
+from kgcp.quality.checks.frame_header import ExifCamera, FrameHeader, check_frames
 
 CAMERA = Camera(4000, 3000, 2900.0, 2900.0, 2010.0, 1490.0)
 DJI = [FrameHeader(f"{number}.jpg", (4000, 3000), "DJI FC300S", 3.61, 26.0) for number in range(20)]
@@ -71,3 +71,36 @@ def test_a_focal_length_that_contradicts_exif_is_reported(
 @pytest.mark.parametrize("focal_35_mm", [24.0, 29.0])
 def test_focal_lengths_in_35_mm_equivalents_have_a_tolerance(focal_35_mm: float) -> None:
     assert not [*check_frames([replace(DJI[0], focal_35_mm=focal_35_mm)], CAMERA)]
+
+
+@pytest.mark.parametrize(
+    ("calibrated", "words"),
+    [
+        (ExifCamera("DJI FC6310", 3.61, 26.0), "are by DJI FC6310, but 20 of 20 frames are not"),
+        (ExifCamera("", 3.61, 39.0), "by 39 mm (35 mm equivalent)"),
+        (ExifCamera("DJI FC300S", 4.4), "0.jpg is by 3.61 mm"),
+    ],
+    ids=["another camera", "digital zoom or crop", "another zoom"],
+)
+def test_a_calibration_of_another_camera_is_reported(calibrated: ExifCamera, words: str) -> None:
+    (doubt,) = check_frames(DJI, CAMERA, calibrated)
+    assert (doubt.code, doubt.is_grave) == (Cause.OTHER_CAMERA, True)
+    assert words in doubt.sentence
+
+
+@pytest.mark.parametrize(
+    "calibrated",
+    [
+        ExifCamera.of(DJI),
+        ExifCamera("Dji FC300S 0123", 3.65, 27.0),  # frames without the serial number
+        ExifCamera(),
+    ],
+)
+def test_the_same_camera_raises_no_doubt(calibrated: ExifCamera) -> None:
+    assert not [*check_frames(DJI, CAMERA, calibrated)]
+
+
+def test_only_what_all_photographs_agree_on_is_stated() -> None:
+    others = [FrameHeader("a.png"), FrameHeader("b.jpg", None, "DJI FC300S", 3.61, 52.0)]
+    assert ExifCamera.of([*DJI, *others]) == ExifCamera("DJI FC300S", 3.61, None)
+    assert ExifCamera.of([FrameHeader("c.jpg", None, "A\nB")]) == ExifCamera()
