@@ -62,6 +62,14 @@ def test_no_file_has_merge_conflict_markers() -> None:
     assert (found.returncode, found.stdout, found.stderr) == (1, "", "")
 
 
+def test_examples_read_frames_as_they_are_stored() -> None:
+    """OpenCV turns frames by the orientation tag of EXIF unless it is told not to."""
+    for page in PAGES:
+        for block in page.read_text(encoding="utf-8").split("```python")[1:]:
+            code, _, _ = block.partition("```")
+            assert ("imread(" in code) == ("cv2.IMREAD_IGNORE_ORIENTATION" in code), page.name
+
+
 def test_no_line_of_a_paragraph_begins_with_a_mark_of_markdown() -> None:
     """Such as the > of a menu, where lines were folded: the rest becomes a quotation or a list."""
     mark = re.compile(r"(?:[-+*>]|#{1,6}|\d+[.)]) ")
