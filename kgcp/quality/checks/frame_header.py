@@ -107,9 +107,13 @@ def _check_sizes(headers: Sequence[FrameHeader], camera: Camera) -> Iterator[Dou
     )
     figures = {"frames": float(wrong), "width_px": float(width), "height_px": float(height)}
     if (width, height) == (camera.height, camera.width):
+        off_px = camera.cx - camera.cy, 0.5 * (width - height)
         remedy = (
-            "exchange width and height in [camera] if the calibration is that of upright frames;"
-            " do not rotate frames, because kgcp reads them as the sensor did"
+            "exchange width and height in [camera], since cx and cy are those of such frames"
+            if off_px[0] * off_px[1] > 0.0
+            else "give a calibration of frames as they are stored: that in flight.toml is of frames"
+            " that were turned by 90°, and to exchange its values would not turn all of it; do not"
+            " turn frames, because kgcp reads them as the sensor did"
         )
     elif abs(width / camera.width - height / camera.height) < 0.01 * width / camera.width:
         remedy = (

@@ -21,7 +21,7 @@ def test_frames_of_the_camera_raise_no_doubt() -> None:
 @pytest.mark.parametrize(
     ("size", "words"),
     [
-        ((3000, 4000), "exchange width and height"),
+        ((3000, 4000), "of frames that were turned by 90°"),
         ((2000, 1500), "is of frames 2 times as large"),
         ((3000, 3000), "give the calibration of these frames"),
     ],
@@ -31,6 +31,11 @@ def test_frames_of_another_size_are_counted(size: tuple[int, int], words: str) -
     assert (doubt.code, doubt.is_grave) == (Cause.FRAME_SIZE, True)
     assert "20 of 20 frames are not 4000 x 3000 px" in doubt.sentence
     assert words in doubt.remedy
+
+
+def test_exchanged_width_and_height_are_told_from_a_turned_calibration() -> None:
+    (doubt,) = check_frames(DJI, replace(CAMERA, width=3000, height=4000))
+    assert doubt.remedy.startswith("exchange width and height in [camera], since cx and cy")
 
 
 def test_a_single_frame_of_another_size_raises_no_grave_doubt() -> None:
