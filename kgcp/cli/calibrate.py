@@ -165,7 +165,7 @@ def command(
         require_formats,
         write_results,
     )
-    from kgcp.quality.calibration_verdict import CalibrationGrade
+    from kgcp.quality.checks.calibration import CalibrationGrade
 
     field = read_field(field_text, unit)
     refuse_to_overwrite_field(field_text, [out / name for name in FIELD_FILES])

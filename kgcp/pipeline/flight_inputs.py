@@ -238,7 +238,11 @@ class FlightInputs:
         """What does not fit, grave doubts first; without what cannot be read."""
         flight = self.flight
         doubts = [
-            *check_camera(flight.camera, is_guessed=flight.is_camera_guessed),
+            *check_camera(
+                flight.camera,
+                is_guessed=flight.is_camera_guessed,
+                grade=flight.calibration_grade,
+            ),
             *check_plates(flight.all_targets),
             *check_target_deviations(flight.all_targets),
             *check_frames(self.headers, flight.camera, flight.exif_camera),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from kgcp.network.focal_changes import FocalChanges, FocalStep, FocalTrend, foca
 from kgcp.network.records import PointPrior
 from kgcp.network.sheet_bends import bend_displacements
 from kgcp.network.turned_files import turned_photographs
+from kgcp.quality.checks.calibration import CalibrationGrade
 from kgcp.quality.disc_light import DiscLight
 from kgcp.quality.eccentricity import parameters_if_neglected
 from kgcp.quality.frame_rays import ray_deviations_px
@@ -40,14 +40,6 @@ _MAX_RADIUS_ERROR = 0.03  # relative, of the stated diameters
 _OTHER_FIELD_SHARE = 0.1
 _MAX_NAMED = 3  # photographs or discs in a message; the others are counted
 _FISHEYE_DEG = 100.0  # field of view beyond which lenses are mostly fisheyes
-
-
-class CalibrationGrade(StrEnum):
-    """What a calibration may be used for."""
-
-    GOOD = "good"
-    LOOK = "to be checked"
-    UNUSABLE = "unusable"
 
 
 @dataclass(frozen=True, slots=True)

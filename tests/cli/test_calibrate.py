@@ -26,6 +26,7 @@ from kgcp.io.formats.camera_writers import CAMERA_FORMATS, CalibratedCamera, cam
 from kgcp.measurement.discs.records import Operator
 from kgcp.network.calibration_records import LensModel, PointModel
 from kgcp.pipeline.check import doubts_before_detecting
+from kgcp.quality.checks.calibration import CalibrationGrade
 from kgcp.quality.checks.doubt import Cause
 from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, photograph
 from kgcp.simulation.imaging import Optics, Sensor
@@ -195,12 +196,25 @@ def test_flight_toml_takes_the_camera_with_its_covariance(
         read_camera_and_targets(tmp_path)
 
 
-@pytest.mark.parametrize(("focal_mm", "codes"), [(24.4, []), (28.0, [Cause.OTHER_CAMERA])])
-def test_a_flight_with_another_zoom_is_doubted(
-    calibration: tuple[Path, Result], tmp_path: Path, focal_mm: float, codes: list[Cause]
+@pytest.mark.parametrize(
+    ("focal_mm", "verdict", "codes"),
+    [
+        (24.4, CalibrationGrade.GOOD, []),  # the focus may change the focal length a little
+        (28.0, CalibrationGrade.GOOD, [Cause.OTHER_CAMERA]),
+        (24.0, CalibrationGrade.LOOK, [Cause.CALIBRATION_VERDICT]),
+    ],
+)
+def test_a_flight_doubts_its_camera_by_what_the_calibration_says(
+    calibration: tuple[Path, Result],
+    tmp_path: Path,
+    focal_mm: float,
+    verdict: CalibrationGrade,
+    codes: list[Cause],
 ) -> None:
-    """The focus may change the focal length a little."""
-    shutil.copy(calibration[0] / "camera.toml", tmp_path)
+    toml = (calibration[0] / "camera.toml").read_text(encoding="utf-8")
+    told = f'verdict = "{json.loads(calibration[1].stdout)["verdict"]}"'
+    assert told in toml
+    (tmp_path / "camera.toml").write_text(toml.replace(told, f'verdict = "{verdict}"'))
     (tmp_path / "flight.toml").write_text(f'[camera]\nfile = "camera.toml"\n{TARGET_TOML}')
     (tmp_path / "frames").mkdir()
     frame = Image.new("L", (CAMERA.width, CAMERA.height))

@@ -31,12 +31,8 @@ from kgcp.network.focal_changes import FocalChanges
 from kgcp.network.photographs_apart import _view_misfits_px
 from kgcp.network.records import CalibrationPrior
 from kgcp.network.sheet_bends import bend_shapes
-from kgcp.quality.calibration_verdict import (
-    CalibrationGrade,
-    calibration_numbers,
-    change_if_neglected,
-    judge,
-)
+from kgcp.quality.calibration_verdict import calibration_numbers, change_if_neglected, judge
+from kgcp.quality.checks.calibration import CalibrationGrade
 from kgcp.quality.disc_light import DiscLight
 from kgcp.quality.frame_rays import compare_cameras
 from kgcp.targets.fields.layout import Field, FieldBar, GridKind, Mark

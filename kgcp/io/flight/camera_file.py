@@ -9,6 +9,7 @@ import numpy as np
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, CalibrationCovariance
 from kgcp.geometry.camera import Camera
 from kgcp.io.flight.toml_draft import toml_text
+from kgcp.quality.checks.calibration import CalibrationGrade
 from kgcp.quality.checks.frame_header import ExifCamera
 
 
@@ -16,6 +17,7 @@ def camera_toml(
     camera: Camera,
     covariance: CalibrationCovariance | None,
     by_exif: ExifCamera | None = None,
+    grade: CalibrationGrade | None = None,
 ) -> str:
     """Return the text of a camera.toml, whose numbers are read back to the last bit.
 
@@ -30,6 +32,7 @@ def camera_toml(
         "",
         *camera_lines(camera),
         *_exif_lines(by_exif or ExifCamera()),
+        *([] if grade is None else [f"verdict = {toml_text(grade.value)}"]),
     ]
     if covariance is None:
         return "\n".join(lines) + "\n"

@@ -13,6 +13,7 @@ from kgcp.geometry.camera import Camera, Response, TimeReference
 from kgcp.io.flight.toml_file import read_toml
 from kgcp.io.flight.toml_table import TomlTable
 from kgcp.io.formats.calibrations import FORMATS, read_calibration
+from kgcp.quality.checks.calibration import CalibrationGrade
 from kgcp.quality.checks.frame_header import ExifCamera
 from kgcp.settings import require_range
 
@@ -30,7 +31,7 @@ OWN_FORMAT = "kgcp"
 _EXIF_KEYS = ("exif_camera", "exif_focal_mm", "exif_focal_35_mm")
 OWN_KEYS = (
     *("width", "height", *CALIBRATION_PARAMETERS, "response", "cov_of", "cov"),
-    *_EXIF_KEYS,
+    *(*_EXIF_KEYS, "verdict"),
 )
 _FORMATS = (OWN_FORMAT, *FORMATS.names)
 # Distances follow from them; a ring's from the one along which its image is longest.
@@ -169,6 +170,20 @@ def read_exif_camera(table: TomlTable, folder: Path) -> ExifCamera:
     return ExifCamera(
         own.optional(name, own.text) or "", *(own.optional(key, own.number) for key in focals_mm)
     )
+
+
+def read_calibration_grade(table: TomlTable, folder: Path) -> CalibrationGrade | None:
+    """Return the verdict of `kgcp calibrate` on the camera; None where there is none.
+
+    Raises
+    ------
+    KgcpError
+        Naming file, key and remedy.
+    """
+    own = _own_table(table, folder)
+    if own is None:
+        return None
+    return own.optional("verdict", lambda key: own.choice(key, CalibrationGrade))
 
 
 def read_plumb_sd_deg(table: TomlTable) -> float | None:

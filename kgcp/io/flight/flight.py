@@ -14,6 +14,7 @@ from kgcp.io.files.safe_read import is_file, is_folder, is_no_file, remedy_for_m
 from kgcp.io.flight.camera_table import (
     CAMERA_KEYS,
     read_calibration_covariance,
+    read_calibration_grade,
     read_camera,
     read_exif_camera,
     read_plumb_sd_deg,
@@ -25,6 +26,7 @@ from kgcp.io.flight.vehicle_table import VehicleTable, read_vehicle
 from kgcp.io.formats.frame_times import FORMATS as TIMES_FORMATS
 from kgcp.io.formats.orientations import FORMATS as POSE_FORMATS
 from kgcp.io.formats.orientations.records import OrientationFileOptions
+from kgcp.quality.checks.calibration import CalibrationGrade
 from kgcp.quality.checks.frame_header import ExifCamera
 from kgcp.settings import require_kind
 from kgcp.targets.layout import Target
@@ -64,6 +66,8 @@ class Flight:
         How well the camera is calibrated; None: flight.toml does not say.
     exif_camera : ExifCamera
         The camera by EXIF of the photographs that it was calibrated from.
+    calibration_grade : CalibrationGrade or None
+        The verdict of `kgcp calibrate` on the camera; None: it is not by `kgcp calibrate`.
     is_camera_guessed : bool
         Whether the camera is only a guess, as `kgcp init` makes it from EXIF.
     plumb_sd_deg : float or None
@@ -85,6 +89,7 @@ class Flight:
     camera: Camera
     calibration_covariance: CalibrationCovariance | None
     exif_camera: ExifCamera
+    calibration_grade: CalibrationGrade | None
     is_camera_guessed: bool
     plumb_sd_deg: float | None
     targets: tuple[Target, ...]
@@ -138,6 +143,7 @@ def read_flight(folder: Path | str) -> Flight:
         camera=read_camera(camera, folder),
         calibration_covariance=read_calibration_covariance(camera, folder),
         exif_camera=read_exif_camera(camera, folder),
+        calibration_grade=read_calibration_grade(camera, folder),
         is_camera_guessed=camera.boolean("guessed", default=False),
         plumb_sd_deg=plumb_sd_deg,
         targets=targets,

@@ -127,7 +127,9 @@ def write_results(
     exported = CalibratedCamera(calibration.camera, calibration.covariance.cov, numbers.rms_px)
     left_out = _left_out(calibration.camera, formats)
     texts = dict(camera_file(exported, form) for form in formats if form not in left_out)
-    texts[CAMERA_FILE] = camera_toml(calibration.camera, calibration.covariance, made.exif_camera)
+    texts[CAMERA_FILE] = camera_toml(
+        calibration.camera, calibration.covariance, made.exif_camera, verdict.grade
+    )
     stated, adjusted = FIELD_FILES
     texts[stated] = field_toml(calibration.field)
     discs = field_discs(calibration)

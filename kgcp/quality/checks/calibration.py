@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from enum import StrEnum
 
 import numpy as np
 
@@ -20,8 +21,18 @@ _MIN_ASPECT = 0.9  # of pixels; no sensor has less square ones
 _MAX_OFF_CENTRE = 0.12  # of a principal point, in frame sizes
 
 
-def check_camera(camera: Camera, *, is_guessed: bool = False) -> Iterator[Doubt]:
-    """Yield doubts about focal lengths, principal points, distortions, and guesses."""
+class CalibrationGrade(StrEnum):
+    """What a calibration may be used for: the verdict of `kgcp calibrate`."""
+
+    GOOD = "good"
+    LOOK = "to be checked"
+    UNUSABLE = "unusable"
+
+
+def check_camera(
+    camera: Camera, *, is_guessed: bool = False, grade: CalibrationGrade | None = None
+) -> Iterator[Doubt]:
+    """Yield doubts about focal lengths, principal points, distortions, guesses, and verdicts."""
     yield from _check_focal_length(camera)
     yield from _check_principal_point(camera)
     yield from _check_corners(camera)
@@ -32,6 +43,19 @@ def check_camera(camera: Camera, *, is_guessed: bool = False) -> Iterator[Doubt]
             " may be wrong by several per cent",
             "give a calibration under [camera], and delete guessed and the sd_ keys of the guess",
             {"fx_px": camera.fx},
+        )
+    if grade is CalibrationGrade.UNUSABLE:
+        yield grave(
+            Cause.CALIBRATION_VERDICT,
+            "the verdict of 'kgcp calibrate' on the camera is that it is unusable",
+            "calibrate it again, by the advice in calibration.html",
+        )
+    elif grade is CalibrationGrade.LOOK:
+        yield mild(
+            Cause.CALIBRATION_VERDICT,
+            "the verdict of 'kgcp calibrate' on the camera is that it is to be checked",
+            "read the reasons in calibration.html, and calibrate it again; if they do not matter,"
+            " delete verdict in camera.toml",
         )
 
 

@@ -51,6 +51,10 @@ class Cause(StrEnum):
         "other_camera",
         "the calibration is of another camera, zoom or crop than the frames, by EXIF",
     )
+    CALIBRATION_VERDICT = (
+        "calibration_verdict",
+        "`kgcp calibrate` found the camera unusable, or to be checked",
+    )
     GUESSED_CAMERA = "guessed_camera", "the camera is a guess from EXIF, not a calibration"
     DISTORTION_SIGN = "distortion_sign", "k1, k2 … have the sign of another distortion model"
     DISTORTION = (

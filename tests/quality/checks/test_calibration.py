@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from kgcp.geometry.camera import Camera
-from kgcp.quality.checks.calibration import check_camera
+from kgcp.quality.checks.calibration import CalibrationGrade, check_camera
 from kgcp.quality.checks.doubt import Cause
 from kgcp.quality.checks.plate import check_plates
 from kgcp.targets.layout import Ring, Target
@@ -85,3 +85,11 @@ def test_layouts_that_the_search_cannot_find_are_reported(
 def test_usual_diameters_raise_no_doubt(diameter: float) -> None:
     ring = Ring("A", diameter, diameter / 2, diameter / 1.4, diameter / 7, (0.0, 43.0))
     assert not [*check_plates([Target(ring)])]
+
+
+def test_only_a_good_verdict_raises_no_doubt() -> None:
+    assert not [*check_camera(CAMERA, grade=CalibrationGrade.GOOD)]
+    (mild,) = check_camera(CAMERA, grade=CalibrationGrade.LOOK)
+    (grave,) = check_camera(CAMERA, grade=CalibrationGrade.UNUSABLE)
+    assert [mild.is_grave, grave.is_grave] == [False, True]
+    assert mild.code == grave.code == Cause.CALIBRATION_VERDICT
