@@ -10,7 +10,7 @@ from pathlib import Path
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera
-from kgcp.io.flight.camera_table import read_camera_file
+from kgcp.io.flight.camera_table import read_camera_file, read_exif_camera_file
 from kgcp.io.flight.folder import FolderContents
 from kgcp.io.flight.toml_draft import DraftKey
 from kgcp.io.formats.calibrations import OF_FLIGHT, read_calibration
@@ -46,7 +46,7 @@ def camera_section(contents: FolderContents, headers: Sequence[FrameHeader]) -> 
         return _no_camera(None, "the headers of the frames do not state their size")
     size = max(sizes, key=lambda each: (sizes[each], each))
     first = next(header for header in headers if header.size_px == size)
-    section = _by_file(contents, size)
+    section = _by_file(contents, first, size)
     if section is not None:
         return section
     section = (
@@ -54,18 +54,20 @@ def camera_section(contents: FolderContents, headers: Sequence[FrameHeader]) -> 
         or _by_focal_length(headers, size)
         or _no_camera(size, "neither EXIF nor a file of the folder states the focal length")
     )
-    return replace(section, gaps=(*section.gaps, *_unfit_files(contents, size)))
+    return replace(section, gaps=(*section.gaps, *_unfit_files(contents, first, size)))
 
 
-def _by_file(contents: FolderContents, size: tuple[int, int]) -> Section | None:
-    """Return the section by the first calibration file that is for frames of this size.
+def _by_file(
+    contents: FolderContents, header: FrameHeader, size: tuple[int, int]
+) -> Section | None:
+    """Return the section by the first calibration file that is for such frames of this size.
 
     A camera.toml of kgcp comes first: it has a covariance.
     """
     for path in sorted(contents.calibrations, key=lambda each: not _is_camera_toml(each)):
         try:
-            camera = _read(path, size)
-        except KgcpError:  # of another size, or of several cameras
+            camera = _read(path, header, size)
+        except KgcpError:  # of another size or camera, or of several cameras
             continue
         name = contents.relative(path)
         keys = (
@@ -81,11 +83,13 @@ def _by_file(contents: FolderContents, size: tuple[int, int]) -> Section | None:
     return None
 
 
-def _unfit_files(contents: FolderContents, size: tuple[int, int]) -> Iterator[Gap]:
+def _unfit_files(
+    contents: FolderContents, header: FrameHeader, size: tuple[int, int]
+) -> Iterator[Gap]:
     """Yield why each calibration file of the folder is not used."""
     for path in contents.calibrations:
         try:
-            _read(path, size)
+            _read(path, header, size)
         except KgcpError as error:
             problem, _, remedy = str(error).removeprefix(f"{path}: ").partition("; ")
             yield Gap("camera", f"{contents.relative(path)} is not used: it {problem}", remedy)
@@ -95,8 +99,8 @@ def _is_camera_toml(path: Path) -> bool:
     return path.suffix == ".toml"
 
 
-def _read(path: Path, size: tuple[int, int]) -> Camera:
-    """Return the camera of a file, if it is one of frames of this size."""
+def _read(path: Path, header: FrameHeader, size: tuple[int, int]) -> Camera:
+    """Return the camera of a file, if it is one of such frames of this size."""
     if not _is_camera_toml(path):
         return read_calibration(path, size, words=_WORDS)
     camera, _ = read_camera_file(path)
@@ -104,6 +108,12 @@ def _read(path: Path, size: tuple[int, int]) -> Camera:
         raise KgcpError(
             f"{path}: is for {camera.width} x {camera.height} px, {_WORDS.other_size} {size[0]} x"
             f" {size[1]}; use the calibration of this frame size"
+        )
+    own, other = read_exif_camera_file(path).difference(header)
+    if own:
+        raise KgcpError(
+            f"{path}: is for {own}, but the frames are by {other}; use the calibration of this"
+            " camera and zoom"
         )
     return camera
 

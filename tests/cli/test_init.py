@@ -28,7 +28,9 @@ from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.io.flight.camera_file import camera_toml
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight, read_flight
+from kgcp.io.images.exif import read_frame_header
 from kgcp.io.images.frames import list_frames
+from kgcp.quality.checks.frame_header import ExifCamera
 from kgcp.simulation.flight import FlightPlan
 from tests.systems import not_on_windows
 
@@ -201,6 +203,22 @@ def test_calibrations_of_another_size_are_named(bare: Path, tmp_path: Path) -> N
     said = " ".join(said.split())
     for name in ("a.txt", "camera.toml"):
         assert f"{name} is not used: it is for 700 x 500 px, but the frames have" in said
+
+
+def test_the_calibration_of_the_frames_zoom_is_taken(bare: Path, tmp_path: Path) -> None:
+    folder = copied(bare, "static", tmp_path)
+    first = list_frames(folder)[0]
+    focal_35_mm = read_frame_header(folder / first, first).focal_35_mm
+    assert focal_35_mm is not None
+    camera = PLAN.settings.camera
+    for name, factor in (("a", 2.0), ("b", 1.0)):
+        text = camera_toml(
+            replace(camera, k1=factor), None, ExifCamera("", None, factor * focal_35_mm)
+        )
+        (folder / f"{name}.toml").write_text(text, encoding="utf-8")
+    flight, _, said = made(folder, *TARGET)
+    assert flight.camera.k1 == 1.0
+    assert "from b.toml (not used: a.toml)" in said
 
 
 @pytest.mark.parametrize("height", ["Höhe", "U"])

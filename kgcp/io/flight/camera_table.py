@@ -164,8 +164,22 @@ def read_exif_camera(table: TomlTable, folder: Path) -> ExifCamera:
         Naming file, key and remedy.
     """
     own = _own_table(table, folder)
-    if own is None:
-        return ExifCamera()
+    return ExifCamera() if own is None else _exif_camera(own)
+
+
+def read_exif_camera_file(path: Path) -> ExifCamera:
+    """Return the camera by EXIF of the photographs that a camera.toml was made from.
+
+    Raises
+    ------
+    KgcpError
+        Naming file, key and remedy.
+    """
+    whole, _ = read_toml(path, ("camera",), "[camera] file")
+    return _exif_camera(whole.table("camera", OWN_KEYS))
+
+
+def _exif_camera(own: TomlTable) -> ExifCamera:
     name, *focals_mm = _EXIF_KEYS
     return ExifCamera(
         own.optional(name, own.text) or "", *(own.optional(key, own.number) for key in focals_mm)
