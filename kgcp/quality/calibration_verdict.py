@@ -13,9 +13,9 @@ from kgcp.network.calibration_records import CameraCalibration, LensModel, Point
 from kgcp.network.equations import view_rows, whitened
 from kgcp.network.field_deviation import FieldDeviation, field_deviation
 from kgcp.network.focal_changes import FocalChanges, FocalStep, FocalTrend, focal_changes
+from kgcp.network.photograph_groups import other_camera, turned_photographs
 from kgcp.network.records import PointPrior
 from kgcp.network.sheet_bends import bend_displacements
-from kgcp.network.turned_files import turned_photographs
 from kgcp.quality.checks.calibration import CalibrationGrade
 from kgcp.quality.disc_light import DiscLight
 from kgcp.quality.eccentricity import parameters_if_neglected
@@ -75,6 +75,7 @@ class CalibrationNumbers:
     bending: FieldBending | None  # None: no bending was estimated
     focal_changes: FocalChanges
     turned: tuple[str, ...]  # photographs whose files were turned by 180° against most others
+    other_camera: tuple[str, ...]  # photographs by another camera than most others
     light: DiscLight | None  # None: levels are not known
 
     @property
@@ -145,6 +146,7 @@ def calibration_numbers(
         _field_bending(calibration),
         focal_changes(calibration.network, calibration.solution, calibration.precision),
         turned_photographs(calibration),
+        other_camera(calibration),
         light,
     )
 
@@ -280,6 +282,11 @@ def _handling_doubts(calibration: CameraCalibration, numbers: CalibrationNumbers
             f"{listed(numbers.turned, _MAX_NAMED)} would fit the others much better if turned"
             " by 180°: the principal point is wrong"
         )
+    elif numbers.other_camera:
+        yield (
+            f"{listed(numbers.other_camera, _MAX_NAMED)} have another focal length or principal"
+            " point than the others, all the same one: they seem to be by another camera"
+        )
     change = _focal_change(calibration, numbers)
     if change is None:
         return
@@ -410,6 +417,11 @@ def _handling_advice(calibration: CameraCalibration, numbers: CalibrationNumbers
         yield (
             "Give all photographs as the camera stored them: programs that apply the orientation of"
             " EXIF turn some. If none was turned, stabilisation may have moved the principal point."
+        )
+    elif numbers.other_camera:
+        yield (
+            "Calibrate each camera by itself, also two of one model, and photographs with another"
+            " zoom, focus or crop."
         )
     change = _focal_change(calibration, numbers)
     if isinstance(change, FocalTrend):

@@ -342,12 +342,14 @@ def test_a_photograph_of_another_zoom_takes_no_part(zoom: float, lens: LensModel
     assert any("Keep zoom, focus and crop" in sentence for sentence in verdict.advice)
 
 
-def from_two_distances(lens_m: float, noise_px: float = SD_PX) -> list[NamedView]:
+def from_two_distances(
+    lens_m: float, noise_px: float = SD_PX, by: Camera = CAMERA
+) -> list[NamedView]:
     """Twelve photographs by a lens that is focused on the field; zero: its focus is fixed."""
     made = []
     for distance_m in (0.3, 0.4):
-        focal_px = 1500.0 * (1.0 + lens_m / distance_m)
-        camera = replace(CAMERA, fx=focal_px, fy=focal_px)
+        focal_px = by.fx * (1.0 + lens_m / distance_m)
+        camera = replace(by, fx=focal_px, fy=focal_px)
         those = views(camera=camera, distance_m=distance_m, noise_px=noise_px)
         made += [replace(view, photo=f"{view.photo} {distance_m}") for view in those]
     return made
@@ -501,7 +503,23 @@ def test_photographs_that_were_turned_and_fit_nearly_are_named() -> None:
 
 def test_photographs_that_were_not_turned_are_not_said_to_be() -> None:
     result = calibrated(from_two_distances(0.0), PointModel.FREE)
-    assert calibration_numbers(result).turned == ()
+    numbers = calibration_numbers(result)
+    assert numbers.turned == numbers.other_camera == ()
+
+
+def test_photographs_by_another_camera_of_the_model_are_named() -> None:
+    """Both kinds fit well enough, but the principal point is that of neither."""
+    made = from_two_distances(0.0)
+    other = replace(CAMERA, fx=1500.5, fy=1500.5, cx=815.0, cy=581.0)
+    for index, view in enumerate(from_two_distances(0.0, by=other)):
+        if index % 2:
+            made[index] = view
+    result = calibrated(made, PointModel.STIFF)
+    numbers = calibration_numbers(result)
+    assert set(numbers.other_camera) in [{v.photo for v in made[k::2]} for k in (0, 1)]
+    verdict = judge(result, numbers)
+    assert "they seem to be by another camera" in verdict.sentence
+    assert any("Calibrate each camera by itself" in sentence for sentence in verdict.advice)
 
 
 def test_with_two_halves_of_two_zooms_none_is_left_out() -> None:
