@@ -344,7 +344,11 @@ def _measured_circles(
     for outline, radius_m in zip(outlines, target.radii_m, strict=True):
         others = [each for each in outlines if each is not outline]
         outcome = measure_disc(
-            grey, outline, neighbours=[*others, *border], response=camera.response
+            grey,
+            outline,
+            neighbours=[*others, *border],
+            response=camera.response,
+            has_border=bool(border),
         )
         if isinstance(outcome, DiscMiss):
             if discs and outcome.reason is DiscReason.CROWDED:

@@ -53,7 +53,7 @@ _MAX_GROWN_PX, _MAX_GROWN = 2.0, 0.4
 # burnt and sharpened have residuals of up to 0.19; what is not a disc, mostly more than 0.3.
 _MAX_EDGE_NOISE, _MAX_OUTLIERS = 0.2, 0.3
 _LEAST_REDUNDANCY = 6.0  # with less, a standard deviation says little of the errors (Student's t)
-_LEAST_CURVED_PX = 6.0  # smaller discs do not tell curved light from blur
+_LEAST_CURVED_PX = 6.0  # smaller discs do not tell curved light from blur or textured ground
 _CURVED = 25.0  # least χ² of five terms; noise alone exceeds it in one of ten thousand discs
 _FOREIGN_SIGMAS, _FOREIGN_CONTRAST = 6.0, 0.12  # least residual of what is neither disc nor ground
 
@@ -75,6 +75,7 @@ class DiscTask:
     others: Sequence[Geometry]  # other edges, whose pixels are left out
     inner: FloatArray = field(default_factory=lambda: NO_INNER)  # as in `DiscPixels`
     is_ground_even: bool = True  # False: the ground has a texture
+    has_border: bool = False  # whether the ground around it is known to be even
 
     @property
     def is_dark(self) -> bool:
@@ -118,7 +119,7 @@ def is_in_curved_light(fit: DiscFit, task: DiscTask) -> bool:
 
     The second order is free only then: if it were always free, that would cost accuracy.
     """
-    if len(task.inner) or task.radius_px < _LEAST_CURVED_PX:
+    if len(task.inner) or (task.radius_px < _LEAST_CURVED_PX and not task.has_border):
         return False
     return not fit.sample.is_burnt and fit.curvature_gain > _CURVED
 

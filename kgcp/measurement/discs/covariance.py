@@ -136,6 +136,9 @@ def scatter_of(adjusted: DiscFit | CompressedFit) -> DiscScatter:
         common[:2, :2] += np.outer(by_curve_px, by_curve_px)
     by_curved_light_px = _curved_light_displacement_px(fit)
     common[:2, :2] += by_curved_light_px @ by_curved_light_px
+    # edges across the second order are displaced outwards or inwards by as much as the centre
+    stretched = by_curved_light_px[[0, 0, 1], [0, 1, 1]]
+    common[2:, 2:] += np.outer(stretched, stretched)
     to_moments = moments_by_stretch(fit.state.geometry)
     return DiscScatter(
         t_variance * (to_moments @ own[:, :GEOMETRY_COUNT] @ to_moments.T),
@@ -286,7 +289,7 @@ def _edges_tell_displacement(fit: DiscFit) -> bool:
 
 
 def _curved_light_displacement_px(fit: DiscFit) -> FloatArray:
-    """Return how far light beyond second order may displace the centre (2, 2) [px].
+    """Return how far light beyond second order may displace centre and edges (2, 2) [px].
 
     The step of a shadow has all orders. The higher orders together count like the second: by as
     much as it changes the light over the margin that is used, relatively, edges may be displaced in

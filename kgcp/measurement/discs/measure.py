@@ -115,6 +115,7 @@ def measure_disc(
     response: Response = Response.UNKNOWN,
     operator: Operator = Operator.MODEL,
     is_ground_even: bool = True,
+    has_border: bool = False,
 ) -> Disc | DiscMiss:
     """Measure one disc, or one edge of a ring, or a ring as a whole.
 
@@ -130,8 +131,12 @@ def measure_disc(
     is_ground_even : bool
         False: its ground has a texture, as grass and gravel have. This has no effect on a ring that
         is measured as a whole, or with another operator than the image model.
+    has_border : bool
+        True: the ground around it is known to be even, so that residuals show uneven light on small
+        discs, too.
     """
-    task = DiscTask(grey, outline, _others(outline, neighbours), inner, is_ground_even)
+    others = _others(outline, neighbours)
+    task = DiscTask(grey, outline, others, inner, is_ground_even, has_border)
     return _measured([task], response, operator, None)[0]
 
 
