@@ -143,7 +143,7 @@ class Reason(StrEnum):
     AMBIGUOUS_PLACE = (
         "ambiguous_place",
         Status.REJECTED,
-        "two things that look like a plain target are where it is predicted",
+        "two things that look like a plain target are where it is predicted, or one where two are",
         "give better poses, or keep the ground clear",
     )
     CROWDED = (

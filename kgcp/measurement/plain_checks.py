@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.special import chdtri
@@ -15,6 +16,7 @@ from kgcp.measurement.discs.covariance import moments_by_stretch
 from kgcp.measurement.discs.records import Disc
 from kgcp.measurement.plain_pose import CircleMoments, CirclesFit
 from kgcp.measurement.plain_prediction import SIGMAS, PlainPrediction
+from kgcp.measurement.records import Measurement, Miss, Outcome
 from kgcp.targets.plain import PlainTarget
 
 # Tuning; `benchmarks.ground.plain_targets` counts what is found and what is taken for a target.
@@ -28,6 +30,9 @@ _MOST_BLUR = 0.5
 _ROUGH_PX = 0.075  # largest displacement of the centre that an uneven edge may cause
 _PLACE_PX = 0.1  # standard deviation of a predicted place, at least
 _UNLIKELY = 1e-4  # probability with which a true target's shape is refused
+# Two targets were measured from the same edge if their centres are nearer than this (in radii) and
+# the ratio of their radii is smaller than this.
+_SAME_PLACE, _SAME_SIZE = 0.35, 1.15
 
 
 def tolerated(images: CircleMoments) -> CircleMoments:
@@ -95,3 +100,37 @@ def check_agreement(
     freedom = 5 * circles - (3 if prediction.normal is not None else 5)
     if freedom and fit.chi2 > chdtri(freedom, _UNLIKELY):
         raise Rejection(Reason.UNLIKE_PREDICTION, f"shape: χ² {fit.chi2:.0f} of {freedom}")
+
+
+def refuse_shared_edges(outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """Return the outcomes of a frame's plain targets, without those measured from the same edge.
+
+    If one of two equal targets is hidden, the other one may be where either is predicted. The frame
+    does not tell which of them it is.
+    """
+    measured = [each for each in outcomes if isinstance(each, Measurement)]
+    others = {
+        each.target: [other.target for other in measured if _share_edge(each, other)]
+        for each in measured
+    }
+    return [
+        Miss(each.target, Reason.AMBIGUOUS_PLACE, _shared_words(each, others[each.target]))
+        if isinstance(each, Measurement) and others[each.target]
+        else each
+        for each in outcomes
+    ]
+
+
+def _share_edge(first: Measurement, second: Measurement) -> bool:
+    radii_px = first.appearance.radius_px, second.appearance.radius_px
+    apart_px = float(np.linalg.norm(first.centre_px - second.centre_px))
+    return (
+        first.target != second.target
+        and apart_px < _SAME_PLACE * min(radii_px)
+        and max(radii_px) < _SAME_SIZE * min(radii_px)
+    )
+
+
+def _shared_words(measurement: Measurement, others: Sequence[str]) -> str:
+    x, y = measurement.centre_px
+    return f"its edge may also be that of {', '.join(others)}; at ({x:.0f}, {y:.0f})"

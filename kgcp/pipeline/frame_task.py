@@ -19,6 +19,7 @@ from kgcp.io.images.frames import read_grey
 from kgcp.io.images.remote import StoredFolder, at_hand
 from kgcp.measurement.frame import examine, miss_of
 from kgcp.measurement.guided import Prediction, measure_guided
+from kgcp.measurement.plain_checks import refuse_shared_edges
 from kgcp.measurement.plain_prediction import PlainPrediction
 from kgcp.measurement.plain_target import measure_plain
 from kgcp.measurement.plate_prior import PlatePrior
@@ -128,7 +129,7 @@ def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
             )
             for target in job.plain_targets
         ]
-        outcomes = completed(job, (*examination.outcomes, *plain))
+        outcomes = completed(job, (*examination.outcomes, *refuse_shared_edges(plain)))
         if job.kept_frames is not None and any(isinstance(outcome, Miss) for outcome in outcomes):
             job.kept_frames.keep(frame_input.frame, grey)
         if job.keeps_dropped:
@@ -259,14 +260,15 @@ def _outcomes_of_second_look(
     """Return the outcomes of coded targets, and of plain ones that are predicted by now."""
     outcomes = _coded_outcomes(job, guided_input, grey, by_target, considered)
     measured = [outcome for outcome in outcomes if isinstance(outcome, Measurement)]
-    plain: dict[str, Outcome] = {}
+    found: list[Outcome] = []
     for target in job.plain_targets:
         prediction = _predicted(guided_input.input, guided_input.plain, target)
         if prediction is not None:
             outcome = measure_plain(grey, job.camera, target, prediction, measured)
             if isinstance(outcome, Measurement):
-                (outcome,) = completed(job, [replace(outcome, is_guided=True)])
-            plain[target.name] = outcome
+                outcome = replace(outcome, is_guided=True)
+            found.append(outcome)
+    plain = {outcome.target: outcome for outcome in completed(job, refuse_shared_edges(found))}
     return tuple(
         plain.get(outcome.target, outcome)
         if isinstance(outcome, Miss) and outcome.reason is Reason.NO_PREDICTION

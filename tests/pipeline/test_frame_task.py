@@ -15,7 +15,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.plain_prediction import PlainPrediction
-from kgcp.measurement.plate_prior import PlatePrior, SceneRotation
+from kgcp.measurement.plate_prior import NormalPrior, PlatePrior, SceneRotation
 from kgcp.measurement.records import FrameResult, Measurement, Miss
 from kgcp.pipeline.execution.journal import to_text
 from kgcp.pipeline.execution.kept_frames import KeptFrames
@@ -30,7 +30,7 @@ from kgcp.pipeline.frame_task import (
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import DECOY_PLATE, TARGET_PLATE
 from kgcp.simulation.imaging import Optics, Sensor
-from kgcp.simulation.plate import image_plate
+from kgcp.simulation.plate import PlainPlate, image_plate
 from kgcp.targets.layout import Ring, Target
 from kgcp.targets.plain import PlainPolarity, PlainTarget
 
@@ -174,3 +174,36 @@ def test_the_known_motion_is_part_of_a_plain_target_s_prediction(
     examine_frame_again(job, GuidedInput(known, first, {}, {"W": where}))
     examine_frame(job, replace(known, priors={}))
     assert seen == [rotation, rotation, None]
+
+
+def test_one_disc_is_not_measured_for_two_plain_targets(tmp_path: Path) -> None:
+    """One of two equal discs is hidden: the other one was measured for both, with full accuracy."""
+    disc = PlainTarget("W1", (0.8,), PlainPolarity.BRIGHT, (0.0, 0.0, 0.0), border_m=0.4)
+    discs = (disc, replace(disc, name="W2"))
+    light = np.full((CAMERA.height, CAMERA.width), 0.3)
+    image_plate(CAMERA, PlainPlate(disc), POSE, Optics(0.7)).paste(light)
+    grey = Sensor().expose(light, 0.9, np.random.default_rng(1))
+    assert cv2.imwrite(str(tmp_path / "a.png"), grey)
+    plain = {
+        each.name: PlainPrediction(
+            CAMERA.project(POSE.translation_m[None])[0] + (off_px, 0.0),
+            25.0 * np.eye(2),
+            POSE.translation_m,
+            0.01,
+            NormalPrior(POSE.normal, 3.0),
+            12.0,
+            "a test",
+        )
+        for each, off_px in zip(discs, (1.0, 14.0), strict=True)
+    }
+    job = DetectionJob(tmp_path, CAMERA, None, (), STRICT, plain_targets=discs)
+    at_once = examine_frame(job, replace(FRAME_INPUT, plain=plain))
+    first = examine_frame(job, FRAME_INPUT)
+    later = examine_frame_again(job, GuidedInput(FRAME_INPUT, first, {}, plain))
+    for result in (at_once, later):
+        assert [each.reason for each in result.outcomes if isinstance(each, Miss)] == [
+            Reason.AMBIGUOUS_PLACE,
+            Reason.AMBIGUOUS_PLACE,
+        ]
+    alone = examine_frame(job, replace(FRAME_INPUT, plain={"W1": plain["W1"]}))
+    assert isinstance(alone.outcomes[0], Measurement)
