@@ -27,9 +27,10 @@ from kgcp.measurement.plain_prediction import PlainPrediction
 from kgcp.measurement.plain_target import measure_plain
 from kgcp.measurement.plate_prior import NormalPrior, SceneRotation
 from kgcp.measurement.records import Measurement, Miss, Outcome
-from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 from kgcp.simulation.plate import PlainPlate, image_plate
 from kgcp.targets.plain import PlainPolarity, PlainTarget, Shape
+from tests.measurement.jpeg import compressed
 
 CAMERA = Camera(200, 160, 900.0, 900.0, 101.3, 78.4, k1=-0.08, response=Response.LINEAR)
 NORMAL = np.array([math.sin(0.4), 0.0, math.cos(0.4)])
@@ -187,6 +188,28 @@ def test_an_unknown_tone_curve_does_not_change_the_size_of_a_far_ring(
     sd = outcome.uncertainty.sd_distance_m / pose.distance_m
     assert least < sd < most
     assert abs(outcome.distance_m / pose.distance_m - 1.0) < 3.0 * sd
+
+
+@pytest.mark.parametrize("polarity", PlainPolarity)
+def test_deviations_of_small_discs_cover_curves_that_one_disc_does_not_tell(
+    polarity: PlainPolarity,
+) -> None:
+    """Film's curve, sharpening and JPEG: RMS errors were 3.9 (bright) and 1.9 deviations (dark)."""
+    target = replace(DISC, polarity=polarity, border_m=1.2)
+    pose = pose_towards(RADIUS_PX / 3.0 * pose_at(90.4, 71.7).translation_m, NORMAL)
+    expected = replace(prediction_of(pose, (2.0, -2.0)), radius_px=3.0)
+    camera = replace(CAMERA, response=Response.UNKNOWN)
+    sensor, errors, sds = Sensor(tone=ToneCurve.FILM, sharpening=0.6), [], []
+    light: FloatArray = np.full((CAMERA.height, CAMERA.width), 0.3)
+    image_plate(CAMERA, PlainPlate(target, 0.7, 0.06), pose, Optics(0.6)).paste(light)
+    for seed in range(4):
+        grey = compressed(sensor.expose(light, 1.0, np.random.default_rng(seed)), 92)
+        outcome = measure_plain(grey, camera, target, expected)
+        assert isinstance(outcome, Measurement)
+        assert outcome.uncertainty is not None
+        errors.append(outcome.distance_m / pose.distance_m - 1.0)
+        sds.append(outcome.uncertainty.sd_distance_m / pose.distance_m)
+    assert np.linalg.norm(errors) < 2.5 * np.linalg.norm(sds)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ which each disc has its own ellipse, blur and light. The result is the prior for
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -88,9 +89,11 @@ _LEAST_STEP = -6.0
 # compression left, discs in focus lose 8 and more, and 45 discs of R 15 px out of focus gain 220 to
 # 410 (`benchmarks.calibrate.operator`).
 _SIGNIFICANT_KURTOSIS, _SIGNIFICANT_IN_COMPRESSED = 16.0, 100.0
+# Standard deviation of a displacement of all edges, as a share of the blur, if fewer than nine
+# discs of a JPEG tell its unknown curve: all curves are off then. Single discs of R 3 px under a
+# film curve, quality 92, are off by 0.13 to 0.28 px; the spread of the curves explains 0.16 px.
+_BY_COMPRESSION_OF_FEW = 0.3
 _LITTLE_BENT = 0.02  # standard deviation of the waves of a curve that counts as not bent
-# Median of χ² by its degrees of freedom; with none, discs share nothing to contradict each other in
-_MEDIAN_CHI2 = {0: 1.0, 1: 0.455, 4: 3.357}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,6 +106,8 @@ class CameraTone:
     blur_px: float = 0.0  # median of the discs that it was learned from; 0: none
     kurtosis: float = 0.0  # excess kurtosis of its point spread
     is_curve_unknown: bool = False  # False: the curve is stated
+    # By how much edges may be displaced by curves that a few discs do not tell apart [px]
+    curve_spread_px: float = 0.0
     is_compressed: bool = False  # whether a photograph is seen to be compressed
     is_reliable: bool = True  # False: compression has left too little to learn from
 
@@ -167,7 +172,11 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
             best = before
         is_reliable = best.is_settled and not are_coarse(steps)
     blur_px = float(np.median([fit.state.blur.mean_sd_px for fit in best.fits]))
-    prior = _prior_by(best)
+    prior = best.prior
+    spread_px = 0.0
+    if camera.is_curve_unknown and len(fits) < _FEWEST_DISCS:
+        by_compression_px = _BY_COMPRESSION_OF_FEW * blur_px * is_compressed
+        spread_px = math.hypot(best.spread_px([*curves.plain, *curves.bent]), by_compression_px)
     if camera.is_curve_unknown and not best.tone.is_shaped and _are_burnt(fits):
         # the curve's upper end is not seen: what it may be off stays in the covariances
         prior = _slightly_bent(prior)
@@ -179,6 +188,7 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
         prior=prior,
         blur_px=blur_px,
         is_reliable=is_reliable,
+        curve_spread_px=spread_px,
     )
 
 
@@ -192,6 +202,7 @@ def unknowns_of_disc(task: DiscTask, camera: CameraTone) -> DiscUnknowns:
         kurtosis=camera.kurtosis,
         is_curve_unknown=camera.is_curve_unknown,
         is_compressed=camera.is_compressed,
+        curve_spread_px=camera.curve_spread_px,
     )
 
 
@@ -327,7 +338,7 @@ def _likeliest_kurtosis(
     gain = in_focus.loss - best.loss
     if gain <= 0.0:
         return 0.0
-    is_worthy = 2.0 * gain > least_gain * _excess(best) ** _EXCESS_POWER
+    is_worthy = 2.0 * gain > least_gain * best.excess**_EXCESS_POWER
     return (begin + steps) * _KURTOSIS_STEP if is_worthy else 0.0
 
 
@@ -362,7 +373,7 @@ def _worth_comparing(plain: Sequence[JointFit], bent: Sequence[JointFit]) -> lis
     if unbent is None or best is None:
         return [joint for joint in (best or unbent,) if joint]
     gain = unbent.loss - best.loss
-    if 2.0 * gain <= _SIGNIFICANT_BENDS * _excess(best) ** _EXCESS_POWER:
+    if 2.0 * gain <= _SIGNIFICANT_BENDS * best.excess**_EXCESS_POWER:
         return [unbent]
     line = next((joint for joint in bent if joint.tone is Tone.UNKNOWN_OVER_LINE), None)
     if unbent.tone is Tone.LINEAR and line is not None:
@@ -553,7 +564,7 @@ def _is_bent(joint: JointFit) -> bool:
     photographs of dark discs of R 5 px seemed to be sRGB's, and centres were off by 0.012 px where
     light falls off by 5 % over the radius. With its square they are off by 0.007 px.
     """
-    waves, excess = joint.shared[:WAVES], _excess(joint)
+    waves, excess = joint.shared[:WAVES], joint.excess
     cov = excess * np.linalg.inv(joint.precision)[:WAVES, :WAVES] + _LITTLE_BENT**2 * np.eye(WAVES)
     square = excess * float(waves @ np.linalg.solve(cov, waves))
     return square > _SIGNIFICANT_BENDS * excess * excess
@@ -566,21 +577,3 @@ def _state_by(fit: DiscFit, tone: Tone, sharpening: float) -> DiscState:
     if not tone.is_srgb:
         vector[[Row.BLACK, Row.WHITE]] = fit.state.plateaus(fit.free.tone)
     return DiscState(vector)
-
-
-def _prior_by(joint: JointFit) -> ProcessingPrior:
-    """Return what discs adjusted together say of the camera, with its precision.
-
-    The precision is divided by the excess by which discs contradict each other.
-    """
-    return ProcessingPrior(joint.shared, joint.precision / _excess(joint))
-
-
-def _excess(joint: JointFit) -> float:
-    """Return the variance of discs' contradictions relative to that of their noise; at least 1."""
-    own = joint.informations[0].any(axis=0)
-    squares = [
-        float(score[own] @ np.linalg.lstsq(information[np.ix_(own, own)], score[own])[0])
-        for score, information in zip(joint.scores, joint.informations, strict=True)
-    ]
-    return max(float(np.median(squares)) / _MEDIAN_CHI2[int(own.sum())], 1.0)

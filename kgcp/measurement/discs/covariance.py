@@ -64,8 +64,10 @@ _BY_DEFOCUS_OF_BURNT = 0.04
 # above is left: 0.007 px of the 0.1 px of an unknown curve. (In simulations, film's curve leaves
 # 0.012 px and sRGB's 0.001 px.) Edges that are nearer to each other than this, in pixels or in
 # blurs, tell it wrongly: with film's curve, distances were off by 3 % at R 2.5 px and by 1.1 % at 3
-# px.
+# px. Between the two, more is left the nearer edges are: with film's curve, sharpening and JPEG,
+# 0.017 px at a gap of 4 px and 0.030 px at 2.5 px.
 _SHARE_LEFT_OF_RING, _LEAST_GAP_PX, _LEAST_GAP = 1.0 / 15.0, 1.9, 3.0
+_WIDE_GAP_PX = 4.0
 # Where the light falls off, a bent curve displaces opposite edges differently, and with them the
 # centre. Its standard deviation is this share of the blur, times the relative change of the light
 # over one radius. In ten draws of photographs, the displacement that discs had in common was half
@@ -125,7 +127,8 @@ def scatter_of(adjusted: DiscFit | CompressedFit) -> DiscScatter:
         freedom = fit.noise_freedom
         arcs, t_variance = float(count), freedom / (freedom - 2.0)
     if _edges_tell_displacement(fit):  # `RingUnknowns` allows for the displacement itself
-        common_px = max(_FLOOR_PX, _SHARE_LEFT_OF_RING * _camera_displacement_px(fit))
+        share = _SHARE_LEFT_OF_RING * max(_WIDE_GAP_PX / _gap_px(fit), 1.0)
+        common_px = max(_FLOOR_PX, share * _camera_displacement_px(fit))
     else:
         common_px = common_displacement_px(fit)
     # an edge that is displaced everywhere alike changes M by a multiple of the identity
@@ -276,16 +279,21 @@ def _camera_displacement_px(fit: DiscFit) -> float:
         by_compression = _BY_COMPRESSION_OF_BURNT * (free.is_compressed or is_smeared)
     elif free.tone is not Tone.LINEAR:
         by_compression = _BY_COMPRESSION * free.is_compressed
-    return math.hypot(by_curve, by_compression, by_defocus) * fit.state.blur.mean_sd_px
+    by_all_px = math.hypot(by_curve, by_compression, by_defocus) * fit.state.blur.mean_sd_px
+    return math.hypot(by_all_px, free.curve_spread_px)
 
 
 def _edges_tell_displacement(fit: DiscFit) -> bool:
     """Tell whether a ring's edges are far enough apart to show how far all are displaced."""
-    pixels, state = fit.sample.pixels, fit.state
-    if not len(pixels.inner):
+    if not len(fit.sample.pixels.inner):
         return False
-    gap_px = -float(np.diff(pixels.circles[:, 2]).max()) * mean_radius_px(state.geometry)
-    return gap_px > max(_LEAST_GAP_PX, _LEAST_GAP * state.blur.mean_sd_px)
+    return _gap_px(fit) > max(_LEAST_GAP_PX, _LEAST_GAP * fit.state.blur.mean_sd_px)
+
+
+def _gap_px(fit: DiscFit) -> float:
+    """Return the least distance of a ring's edges [px]."""
+    radii = fit.sample.pixels.circles[:, 2]
+    return -float(np.diff(radii).max()) * mean_radius_px(fit.state.geometry)
 
 
 def _curved_light_displacement_px(fit: DiscFit) -> FloatArray:

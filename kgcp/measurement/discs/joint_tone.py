@@ -43,6 +43,8 @@ _COMPRESSION_ROUNDS, _SETTLED_NOISE, _SETTLED = 40, 0.05, 0.003
 _LEAST_PROMISE = 0.1  # a step that promises a smaller gain in log-likelihood is not taken
 _DAMPING, _DAMPED, _MOST_DAMPING = 1e-6, 1e-3, 1e3
 _SHARED = np.array(CAMERA_ROWS)
+# Median of χ² by its degrees of freedom; with none, discs share nothing to contradict each other in
+_MEDIAN_CHI2 = {0: 1.0, 1: 0.455, 4: 3.357}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,6 +64,36 @@ class JointFit:
     def shared(self) -> FloatArray:
         """What the discs share (4,)."""
         return np.asarray(self.fits[0].state.vector[_SHARED])
+
+    @property
+    def excess(self) -> float:
+        """Variance of discs' contradictions relative to that of their noise; at least 1."""
+        own = self.informations[0].any(axis=0)
+        squares = [
+            float(score[own] @ np.linalg.lstsq(information[np.ix_(own, own)], score[own])[0])
+            for score, information in zip(self.scores, self.informations, strict=True)
+        ]
+        return max(float(np.median(squares)) / _MEDIAN_CHI2[int(own.sum())], 1.0)
+
+    @property
+    def prior(self) -> ProcessingPrior:
+        """What the discs say of the camera.
+
+        The precision is divided by the excess by which discs contradict each other.
+        """
+        return ProcessingPrior(self.shared, self.precision / self.excess)
+
+    def spread_px(self, others: Sequence[JointFit]) -> float:
+        """Return the RMS difference of the radii by other curves, by their likelihood [px]."""
+        radii, own = np.array([each.radii_px for each in others]), self.radii_px
+        losses = np.array([each.loss for each in others])
+        weights = np.exp((losses.min() - losses) / self.excess)
+        return float(np.sqrt(np.average(np.mean((radii - own) ** 2, axis=1), weights=weights)))
+
+    @property
+    def radii_px(self) -> FloatArray:
+        """Mean radii of the discs (k,)."""
+        return np.array([mean_radius_px(fit.state.geometry) for fit in self.fits])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
