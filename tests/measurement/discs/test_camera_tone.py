@@ -190,6 +190,20 @@ def test_the_edge_of_a_shadow_does_not_bend_the_curve() -> None:
     assert camera.prior.mean[:4] == pytest.approx(np.zeros(4), abs=0.02)
 
 
+def test_a_single_disc_by_a_linear_camera_is_learned_from() -> None:
+    """By sRGB's curve, its light seems to be curved; without a curve, edges were off by 0.15 px."""
+    camera = Camera(80, 80, 2e5, 2e5, 39.3, 40.2)
+    scene = FieldScene((SimulatedDisc((0.0, 0.0, 0.0), 28.0 / 2e5),), 0.1, 0.62)
+    light = field_irradiance(camera, POSE, scene, Optics(0.6))
+    for seed in range(3):
+        photo = Sensor().expose(light, 1.0, np.random.default_rng(seed))
+        task = DiscTask(photo, find_outlines(photo)[0], [], has_border=True)
+        learned = learn_tone([[task]], Response.UNKNOWN)
+        assert learned.tone is Tone.LINEAR
+        assert learned.prior is not None
+        assert 0.0 < learned.curve_spread_px < 0.3
+
+
 def test_a_disc_with_a_bad_start_does_not_diverge() -> None:
     camera = Camera(260, 60, 2e5, 2e5, 129.5, 29.5)
     pose = Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
