@@ -10,7 +10,7 @@ from pathlib import Path
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera
-from kgcp.io.flight.camera_table import read_camera_file, read_exif_camera_file
+from kgcp.io.flight.camera_table import read_camera_file
 from kgcp.io.flight.folder import FolderContents
 from kgcp.io.flight.toml_draft import DraftKey
 from kgcp.io.formats.calibrations import OF_FLIGHT, read_calibration
@@ -103,13 +103,14 @@ def _read(path: Path, header: FrameHeader, size: tuple[int, int]) -> Camera:
     """Return the camera of a file, if it is one of such frames of this size."""
     if not _is_camera_toml(path):
         return read_calibration(path, size, words=_WORDS)
-    camera, _ = read_camera_file(path)
+    stated = read_camera_file(path)
+    camera = stated.camera
     if (camera.width, camera.height) != size:
         raise KgcpError(
             f"{path}: is for {camera.width} x {camera.height} px, {_WORDS.other_size} {size[0]} x"
             f" {size[1]}; use the calibration of this frame size"
         )
-    own, other = read_exif_camera_file(path).difference(header)
+    own, other = stated.by_exif.difference(header)
     if own:
         raise KgcpError(
             f"{path}: is for {own}, but the frames are by {other}; use the calibration of this"

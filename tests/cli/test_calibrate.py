@@ -130,7 +130,8 @@ def calibration(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple
 def test_the_camera_is_the_one_that_took_the_photographs(
     calibration: tuple[Path, Result],
 ) -> None:
-    camera, covariance = read_camera_file(calibration[0] / "camera.toml")
+    stated = read_camera_file(calibration[0] / "camera.toml")
+    camera, covariance = stated.camera, stated.covariance
     assert covariance is not None
     sd = np.sqrt(covariance.cov.diagonal())
     errors = np.array([camera.fx - 390.0, camera.fy - 390.0, camera.cx - 204.2, camera.cy - 146.5])
@@ -185,7 +186,8 @@ def test_flight_toml_takes_the_camera_with_its_covariance(
     toml = f'[camera]\nfile = "camera.toml"\n{form}\n{TARGET_TOML}'
     (tmp_path / "flight.toml").write_text(toml)
     camera, covariance, _ = read_camera_and_targets(tmp_path)
-    own_camera, own_covariance = read_camera_file(out / "camera.toml")
+    own = read_camera_file(out / "camera.toml")
+    own_camera, own_covariance = own.camera, own.covariance
     assert camera == own_camera
     assert camera.response is Response.LINEAR
     assert covariance is not None
@@ -252,7 +254,7 @@ def test_a_format_with_one_focal_length_does_not_force_it_on_the_camera(tmp_path
     assert told["not_used"] == {}
     written = {Path(name).name for name in told["files"]}
     assert written == {path.name for path in out.iterdir()} >= {"camera.toml", "opencv.yml"}
-    camera, _ = read_camera_file(out / "camera.toml")
+    camera = read_camera_file(out / "camera.toml").camera
     assert camera.fx == pytest.approx(390.0, abs=2.0)
     assert camera.fy == pytest.approx(370.0, abs=2.0)
 
@@ -294,7 +296,7 @@ def test_another_calibration_is_compared_with(
     own = calibration[0] / "camera.toml"
     field = photos / "field.toml"
     chosen = ("--points", "fixed", "--model", "radial", "--operator", "centroid", "--json")
-    camera = read_camera_file(own)[0]
+    camera = read_camera_file(own).camera
     longer = tmp_path / "longer.yml"
     calibrated = CalibratedCamera(replace(camera, fx=1.01 * camera.fx), np.eye(12), 0.0)
     longer.write_text(camera_file(calibrated, "opencv")[1])

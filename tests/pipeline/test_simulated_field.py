@@ -55,7 +55,8 @@ def rows(path: Path) -> Iterator[dict[str, str]]:
 
 def test_the_written_truth_agrees_with_the_discs_in_the_photographs(folder: Path) -> None:
     field = read_field(str(folder / "field.toml"))
-    camera, covariance = read_camera_file(folder / "true_camera.toml")
+    stated = read_camera_file(folder / "true_camera.toml")
+    camera, covariance = stated.camera, stated.covariance
     assert (field, camera, covariance) == (FIELD, CAMERA, None)
     points_m = np.array(
         [[float(row[axis]) for axis in "xyz"] for row in rows(folder / "true_field.csv")]

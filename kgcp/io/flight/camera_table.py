@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,13 +38,26 @@ _FORMATS = (OWN_FORMAT, *FORMATS.names)
 _BOTH = "state how well fx and fy are known, both: what is not stated counts as exact"
 
 
-def read_camera(table: TomlTable, folder: Path) -> Camera:
+@dataclass(frozen=True, slots=True)
+class StatedCamera:
+    """A camera, and what its file states about how it was calibrated."""
+
+    camera: Camera
+    covariance: CalibrationCovariance | None  # None: nothing says how well it is known
+    by_exif: ExifCamera  # of the photographs that it was calibrated from
+    grade: CalibrationGrade | None  # the verdict of `kgcp calibrate`; None: there is none
+
+
+def read_camera(table: TomlTable, folder: Path) -> StatedCamera:
     """Return the camera, from the table or the calibration file that it names.
+
+    A camera.toml brings its covariance with it. Beside it the table may state another.
 
     Raises
     ------
     KgcpError
-        Naming file, key and remedy.
+        Naming file, key and remedy: also for negative deviations, a matrix that is not a
+        covariance, both of them, or accuracies without those of both fx and fy.
     """
     response = table.optional("response", lambda key: table.choice(key, Response))
     moment = table.optional("time_reference", lambda key: table.choice(key, TimeReference))
@@ -53,15 +66,38 @@ def read_camera(table: TomlTable, folder: Path) -> Camera:
         raise table.error(
             "motion_sd_deg_s", "has no effect without readout_s", "add readout_s, or delete it"
         )
-    camera = _file_camera(table, folder) if "file" in table else _inline_camera(table)
+    stated = _stated_by_file(table, folder) if "file" in table else _stated_inline(table)
     with table.located():
-        return replace(
-            camera,
-            response=response or camera.response,
+        camera = replace(
+            stated.camera,
+            response=response or stated.camera.response,
             readout_s=readout_s,
-            motion_sd_deg_s=table.number("motion_sd_deg_s", camera.motion_sd_deg_s),
+            motion_sd_deg_s=table.number("motion_sd_deg_s", stated.camera.motion_sd_deg_s),
             time_reference=moment or TimeReference.MIDDLE,
         )
+    return replace(stated, camera=camera, covariance=_covariance(table) or stated.covariance)
+
+
+def _stated_by_file(table: TomlTable, folder: Path) -> StatedCamera:
+    for key in ("guessed", *CALIBRATION_PARAMETERS):
+        if key in table:
+            raise table.error(key, "is given beside a calibration file", "delete one of the two")
+    own = _own_table(table, folder)
+    if own is not None:
+        return read_camera(own, folder)
+    camera = read_calibration(
+        table.existing_file("file", folder),
+        (table.optional("width", table.integer), table.optional("height", table.integer)),
+        table.optional("format", lambda key: table.choice(key, _FORMATS)),
+        table.optional("camera", table.text),
+    )
+    return StatedCamera(camera, None, ExifCamera(), None)
+
+
+def _stated_inline(table: TomlTable) -> StatedCamera:
+    camera = _inline_camera(table)
+    grade = table.optional("verdict", lambda key: table.choice(key, CalibrationGrade))
+    return StatedCamera(camera, None, _exif_camera(table), grade)
 
 
 def _inline_camera(table: TomlTable) -> Camera:
@@ -76,25 +112,8 @@ def _inline_camera(table: TomlTable) -> Camera:
         return Camera(width, height, **values)
 
 
-def _file_camera(table: TomlTable, folder: Path) -> Camera:
-    for key in ("guessed", *CALIBRATION_PARAMETERS):
-        if key in table:
-            raise table.error(key, "is given beside a calibration file", "delete one of the two")
-    own = _own_table(table, folder)
-    if own is not None:
-        return read_camera(own, folder)
-    return read_calibration(
-        table.existing_file("file", folder),
-        (table.optional("width", table.integer), table.optional("height", table.integer)),
-        table.optional("format", lambda key: table.choice(key, _FORMATS)),
-        table.optional("camera", table.text),
-    )
-
-
 def _own_table(table: TomlTable, folder: Path) -> TomlTable | None:
-    """Return the [camera] of the camera.toml that a table names; None: it names none."""
-    if "file" not in table:
-        return None
+    """Return the [camera] of the camera.toml that a table names; None: it names another file."""
     path = table.existing_file("file", folder)
     form = table.optional("format", lambda key: table.choice(key, _FORMATS))
     if form != OWN_FORMAT and (form is not None or path.suffix != ".toml"):
@@ -106,8 +125,8 @@ def _own_table(table: TomlTable, folder: Path) -> TomlTable | None:
     return whole.table("camera", OWN_KEYS)
 
 
-def read_camera_file(path: Path) -> tuple[Camera, CalibrationCovariance | None]:
-    """Return the camera of a camera.toml, and how well it is known.
+def read_camera_file(path: Path) -> StatedCamera:
+    """Return the camera of a camera.toml.
 
     Raises
     ------
@@ -115,21 +134,11 @@ def read_camera_file(path: Path) -> tuple[Camera, CalibrationCovariance | None]:
         Naming file, key and remedy.
     """
     whole, _ = read_toml(path, ("camera",), "[camera] file")
-    table = whole.table("camera", OWN_KEYS)
-    return read_camera(table, path.parent), read_calibration_covariance(table, path.parent)
+    return read_camera(whole.table("camera", OWN_KEYS), path.parent)
 
 
-def read_calibration_covariance(table: TomlTable, folder: Path) -> CalibrationCovariance | None:
-    """Return how well the camera is calibrated; None where nothing is said about it.
-
-    A camera.toml brings its covariance with it. Beside it the table may state another.
-
-    Raises
-    ------
-    KgcpError
-        Naming file, key and remedy: for negative deviations, a matrix that is not a
-        covariance, both of them, or accuracies without those of both fx and fy.
-    """
+def _covariance(table: TomlTable) -> CalibrationCovariance | None:
+    """Return how well the table says that the camera is known; None: it says nothing."""
     deviations = [key for key in DEVIATION_KEYS if key in table]
     if "cov" in table or "cov_of" in table:
         if deviations:
@@ -142,8 +151,7 @@ def read_calibration_covariance(table: TomlTable, folder: Path) -> CalibrationCo
         with table.located():
             return CalibrationCovariance.of(names, cov)
     if not deviations:
-        own = _own_table(table, folder)
-        return None if own is None else read_calibration_covariance(own, folder)
+        return None
     for key in ("sd_fx", "sd_fy"):
         if key not in table:
             raise table.error(key, "is missing", _BOTH)
@@ -155,49 +163,12 @@ def read_calibration_covariance(table: TomlTable, folder: Path) -> CalibrationCo
         return CalibrationCovariance.of(names, np.diag(sd**2))
 
 
-def read_exif_camera(table: TomlTable, folder: Path) -> ExifCamera:
-    """Return the camera by EXIF of the photographs that the named camera.toml was made from.
-
-    Raises
-    ------
-    KgcpError
-        Naming file, key and remedy.
-    """
-    own = _own_table(table, folder)
-    return ExifCamera() if own is None else _exif_camera(own)
-
-
-def read_exif_camera_file(path: Path) -> ExifCamera:
-    """Return the camera by EXIF of the photographs that a camera.toml was made from.
-
-    Raises
-    ------
-    KgcpError
-        Naming file, key and remedy.
-    """
-    whole, _ = read_toml(path, ("camera",), "[camera] file")
-    return _exif_camera(whole.table("camera", OWN_KEYS))
-
-
-def _exif_camera(own: TomlTable) -> ExifCamera:
+def _exif_camera(table: TomlTable) -> ExifCamera:
     name, *focals_mm = _EXIF_KEYS
     return ExifCamera(
-        own.optional(name, own.text) or "", *(own.optional(key, own.number) for key in focals_mm)
+        table.optional(name, table.text) or "",
+        *(table.optional(key, table.number) for key in focals_mm),
     )
-
-
-def read_calibration_grade(table: TomlTable, folder: Path) -> CalibrationGrade | None:
-    """Return the verdict of `kgcp calibrate` on the camera; None where there is none.
-
-    Raises
-    ------
-    KgcpError
-        Naming file, key and remedy.
-    """
-    own = _own_table(table, folder)
-    if own is None:
-        return None
-    return own.optional("verdict", lambda key: own.choice(key, CalibrationGrade))
 
 
 def read_plumb_sd_deg(table: TomlTable) -> float | None:

@@ -13,10 +13,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.io.files.safe_read import is_file, is_folder, is_no_file, remedy_for_missing
 from kgcp.io.flight.camera_table import (
     CAMERA_KEYS,
-    read_calibration_covariance,
-    read_calibration_grade,
     read_camera,
-    read_exif_camera,
     read_plumb_sd_deg,
 )
 from kgcp.io.flight.target_table import read_plain_targets, read_targets
@@ -132,6 +129,7 @@ def read_flight(folder: Path | str) -> Flight:
     plumb_sd_deg = read_plumb_sd_deg(camera)
     if plumb_sd_deg is not None and (vehicle is None or vehicle.settings.level_sd_deg is None):
         raise camera.error("plumb_sd_deg", "needs [vehicle] level_sd_deg", "give both or none")
+    stated = read_camera(camera, folder)
     return Flight(
         folder=folder,
         name=table.optional("name", table.name) or _name_of(folder),
@@ -140,10 +138,10 @@ def read_flight(folder: Path | str) -> Flight:
         times_file=times_file,
         times_format=times_format,
         may_use_exif_times=times_file is None or exif_fallback,
-        camera=read_camera(camera, folder),
-        calibration_covariance=read_calibration_covariance(camera, folder),
-        exif_camera=read_exif_camera(camera, folder),
-        calibration_grade=read_calibration_grade(camera, folder),
+        camera=stated.camera,
+        calibration_covariance=stated.covariance,
+        exif_camera=stated.by_exif,
+        calibration_grade=stated.grade,
         is_camera_guessed=camera.boolean("guessed", default=False),
         plumb_sd_deg=plumb_sd_deg,
         targets=targets,
@@ -201,11 +199,11 @@ def read_camera_and_targets(
         As `read_flight`, for what is wrong with them.
     """
     table, _ = _read_flight_toml(folder)
-    camera = table.table("camera", CAMERA_KEYS)
+    stated = read_camera(table.table("camera", CAMERA_KEYS), folder)
     targets = read_targets(table, folder)
     return (
-        read_camera(camera, folder),
-        read_calibration_covariance(camera, folder),
+        stated.camera,
+        stated.covariance,
         (*targets, *read_plain_targets(table, _names_of(targets))),
     )
 

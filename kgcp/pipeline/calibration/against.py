@@ -44,7 +44,7 @@ def read_other(path: Path, photos: Sequence[Photo]) -> OtherCalibration:
     usual = max(sizes, key=lambda size: (sizes[size], size)) if sizes else (None, None)
     if path.suffix != ".toml":
         return OtherCalibration(path.name, read_calibration(path, usual, words=_WORDS))
-    camera, _ = read_camera_file(path)
+    camera = read_camera_file(path).camera
     if sizes and usual != (camera.width, camera.height):
         raise KgcpError(
             f"{path}: is for frames of {camera.width} x {camera.height} px, but the photographs"

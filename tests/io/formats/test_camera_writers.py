@@ -162,7 +162,8 @@ def test_camera_toml_contains_the_covariance(tmp_path: Path) -> None:
     known = CalibrationCovariance(covariance(("fx", "fy", "cx", "cy", "k1", "k3")))
     path = tmp_path / "camera.toml"
     path.write_text(camera_toml(camera, known), encoding="utf-8")
-    read, read_covariance = read_camera_file(path)
+    stated = read_camera_file(path)
+    read, read_covariance = stated.camera, stated.covariance
     assert read == camera
     assert read_covariance is not None
     assert np.array_equal(read_covariance.cov, known.cov)
