@@ -333,4 +333,4 @@ def _doubt(excursions: Sequence[_Excursion], motion: Motion) -> Doubt:
 
 
 def _utc(unix_s: float) -> str:
-    return f"{date_of(unix_s):%Y-%m-%d %H:%M:%S.%f}"
+    return f"{date_of(unix_s):%Y-%m-%d %H:%M:%S.%f}".rstrip("0").rstrip(".")

@@ -33,7 +33,7 @@ def test_one_epoch_that_jumps_is_named(rate_hz: float, jump_m: float, sd_m: floa
     position_m[row, 2] += jump_m
     (doubt,) = check_spikes(motion(time_s, position_m, sd_m))
     assert (doubt.code, doubt.is_grave) == (Cause.TRAJECTORY_SPIKE, False)
-    assert "2026-06-16 08:15:20.000000 UTC" in doubt.sentence
+    assert "2026-06-16 08:15:20 UTC" in doubt.sentence
     assert doubt.figures["jump_m"] == pytest.approx(jump_m, abs=5.0)
     assert doubt.figures["epochs"] == 1.0
 
@@ -58,7 +58,7 @@ def test_a_run_that_jumps_and_returns_is_named(
     row = int(np.searchsorted(time_s, 20.0))
     position_m[row : row + epochs] += [3.0, -2.0, 4.0]
     (doubt,) = check_spikes(motion(time_s, position_m, sd_m))
-    assert f"the {epochs} epochs from 2026-06-16 08:15:20.000000 to" in doubt.sentence
+    assert f"the {epochs} epochs from 2026-06-16 08:15:20 to" in doubt.sentence
     assert "m from those before and after them:" in doubt.sentence
     assert doubt.figures["jump_m"] == pytest.approx(np.sqrt(29.0), abs=1.0)
     assert doubt.figures["epochs"] == float(epochs)
@@ -160,7 +160,7 @@ def test_a_repeated_position_is_no_stop(rate_hz: float) -> None:
     (doubt,) = check_spikes(motion(time_s, driven(np.minimum(time_s, 30.0))))
     assert doubt.code == Cause.TRAJECTORY_SPIKE
     assert doubt.is_grave
-    assert "from 2026-06-16 08:15:30.000000 UTC on" in doubt.sentence
+    assert "from 2026-06-16 08:15:30 UTC on" in doubt.sentence
     assert doubt.figures["lasts_s"] == pytest.approx(29.5, abs=0.51)
     brakes_s = 9.0 / 5.0  # at 5 m/s²
     since_s = np.clip(time_s - 30.0, 0.0, brakes_s)
