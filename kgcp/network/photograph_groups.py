@@ -35,6 +35,8 @@ _CHANGING = ("cx", "cy", "p1", "p2")  # have the other sign in a photograph that
 _MIN_PLACES = 10
 _MAX_LEFT = 0.7
 _STARTS = 8
+# Columns of what differs between two cameras: the focal length, and x and y of the principal point
+_OF_CAMERA = {"fx": 0, "fy": 0, "cx": 1, "cy": 2}
 # A-priori standard deviation of the difference between two cameras, relative to the focal length
 # and to the width of the frame.
 _OTHER_SD = 0.005
@@ -104,7 +106,8 @@ def turned_photographs(calibration: CameraCalibration) -> tuple[str, ...]:
     middle = np.array([0.5 * (camera.width - 1), 0.5 * (camera.height - 1), 0.0, 0.0])
     start = estimate.cameras[0, changing] - middle
     values = np.eye(len(names))[:, changing]
-    blocks = _blocks(network, replace(solution, estimate=estimate), values, start, changing)
+    solution, prior = replace(solution, estimate=estimate), np.zeros((len(_CHANGING),) * 2)
+    blocks = _blocks(network, solution, values, start, changing, prior)
     together = np.ones(len(calibration.views))
     signs = _best_signs(blocks)
     left, left_together = (blocks.squares - blocks.gain(each) for each in (signs, together))
@@ -120,14 +123,13 @@ def other_camera(calibration: CameraCalibration) -> tuple[str, ...]:
         return ()
     network, solution, camera = calibration.network, calibration.solution, calibration.camera
     names = network.model.names
-    values = np.zeros((len(names), 3))
+    values, start = np.zeros((len(names), 3)), np.zeros(3)
     for row, name in enumerate(names):
-        if name in ("fx", "fy"):
-            values[row, 0] = solution.estimate.cameras[0, row]
-        elif name in ("cx", "cy"):
-            values[row, 1 + ("cx", "cy").index(name)] = camera.width
-    blocks = _blocks(network, solution, values, np.zeros(3), np.array([], np.intp))
-    blocks = replace(blocks, prior=np.eye(3) / _OTHER_SD**2)
+        if name in _OF_CAMERA:
+            unit = camera.width if name in ("cx", "cy") else solution.estimate.cameras[0, row]
+            values[row, _OF_CAMERA[name]] = unit
+    prior = np.eye(3) / _OTHER_SD**2
+    blocks = _blocks(network, solution, values, start, np.array([], np.intp), prior)
     signs = _best_signs(blocks)
     count = blocks.right.size
     by_two, by_each = blocks.gain(signs), blocks.gain_of_own_values()
@@ -172,6 +174,7 @@ def _blocks(
     values: FloatArray,
     start: FloatArray,
     replaced: IndexArray,
+    prior: FloatArray,
 ) -> _Blocks:
     """Return the equations of values that have another sign in some photographs.
 
@@ -183,6 +186,8 @@ def _blocks(
         The values in the estimate.
     replaced : (r,) array
         Numbers of the parameters that the values stand for; the others remain unknowns.
+    prior : (c, c) array
+        Normal matrix of the prior of the values, which are zero by it.
     """
     estimate = solution.estimate
     equations = view_rows(network, estimate, solution.weights)
@@ -207,7 +212,7 @@ def _blocks(
     return _Blocks(
         squares - float(left @ inverse @ left),
         len(others),
-        np.zeros((values.shape[1],) * 2),
+        prior,
         np.array(each),
         np.array(right) - np.einsum("vua,u->va", taken, left),
         np.einsum("iua,jub->ijab", kept, taken),

@@ -28,7 +28,7 @@ from kgcp.io.images.exif import read_frame_header
 from kgcp.io.images.frames import list_frames
 from kgcp.io.images.remote import StoredFolder, at_hand
 from kgcp.io.tables.provenance import TARGET_TABLE
-from kgcp.io.tables.staleness import changed_since_orient, shown
+from kgcp.io.tables.staleness import changed_since_orient, listed_changes
 from kgcp.quality.checks.calibration import check_camera
 from kgcp.quality.checks.camera_position import check_camera_position
 from kgcp.quality.checks.clock import (
@@ -391,7 +391,7 @@ def outdated_poses(file: Path, flight: Flight) -> tuple[Doubt, ...]:
         doubt(
             Cause.REFERENCE,
             f"{file}: 'kgcp orient' computed these poses before flight.toml was changed:"
-            f" {shown(changes)}",
+            f" {listed_changes(changes)}",
             "repeat 'kgcp orient', after 'kgcp detect' if that must be repeated, too",
         ),
     )

@@ -135,8 +135,8 @@ def changed_since_orient(poses: Path, flight: Flight) -> list[str]:
     return []
 
 
-def shown(changes: Sequence[str]) -> str:
-    """Return changes in a row; if there are many, some are only counted."""
+def listed_changes(changes: Sequence[str]) -> str:
+    """Return changes in words; if there are many, some are only counted."""
     return listed(changes, _MAX_CHANGES_SHOWN)
 
 
@@ -163,7 +163,7 @@ def _outdated(
 ) -> KgcpError:
     return KgcpError(
         f"{path}: does not belong to this flight any more; changed since 'kgcp detect':"
-        f" {shown(changes)}; {_remedy(path, flight, settings)}"
+        f" {listed_changes(changes)}; {_remedy(path, flight, settings)}"
     )
 
 

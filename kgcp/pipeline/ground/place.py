@@ -99,7 +99,7 @@ class FlightPlaces:
         The metadata of the tables.
     motions : CameraMotions or None
         Motions of the camera if it has a rolling shutter.
-    of_poses : tuple of str
+    doubts_of_poses : tuple of str
         Doubts about the file of the poses.
     """
 
@@ -109,7 +109,7 @@ class FlightPlaces:
     local_frame: LocalFrame
     provenance: Mapping[str, str]
     motions: CameraMotions | None = None
-    of_poses: tuple[str, ...] = ()
+    doubts_of_poses: tuple[str, ...] = ()
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -134,7 +134,7 @@ class FlightPlaces:
             noise_sentence(self.placement),
             motion_sentence(self.motions, self.flight.camera),
         )
-        return (*self.of_poses, *doubts, *(sentence for sentence in of_all if sentence))
+        return (*self.doubts_of_poses, *doubts, *(sentence for sentence in of_all if sentence))
 
     def gcps(self) -> tuple[Gcp, ...]:
         """Return a ground control point at the placed target for every sighting that took part."""
@@ -216,8 +216,8 @@ def place_flight(
     used = _used_sightings(placement, sightings)
     reference = flight.reference
     file = options.poses or (None if reference is None else reference.file)
-    of_poses = () if file is None else tuple(map(str, outdated_poses(file, flight)))
-    return FlightPlaces(flight, placement, used, local_frame, provenance, motions, of_poses)
+    doubts = () if file is None else tuple(map(str, outdated_poses(file, flight)))
+    return FlightPlaces(flight, placement, used, local_frame, provenance, motions, doubts)
 
 
 def _require_fit(placement: Placement, flight: Flight, poses: Path | None) -> None:

@@ -107,10 +107,11 @@ def _check_sizes(headers: Sequence[FrameHeader], camera: Camera) -> Iterator[Dou
     )
     figures = {"frames": float(wrong), "width_px": float(width), "height_px": float(height)}
     if (width, height) == (camera.height, camera.width):
-        off_px = camera.cx - camera.cy, 0.5 * (width - height)
+        # the principal point is near the middle of the frames that it belongs to
+        is_of_such_frames = (camera.cx > camera.cy) == (width > height)
         remedy = (
             "exchange width and height in [camera], since cx and cy are those of such frames"
-            if off_px[0] * off_px[1] > 0.0
+            if is_of_such_frames
             else "give a calibration of frames as they are stored: that in flight.toml is of frames"
             " that were turned by 90°, and to exchange its values would not turn all of it; do not"
             " turn frames, because kgcp reads them as the sensor did"
