@@ -22,6 +22,7 @@ from kgcp.measurement.discs.fit_disc import (
     DiscUnknowns,
     NoFit,
     disc_fit_at,
+    linearised_at,
     newton_step,
     noise_at,
 )
@@ -44,6 +45,20 @@ _BLOCK_PX = 8
 # cases. In light that falls off by 5 % over the radius, centres of dark discs of R 8 px are then
 # off by 0.015 px, 1.5 to 2 stated deviations.
 _COARSE_STEP = 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObservedNoise:
+    """The noise of what a disc is adjusted to."""
+
+    sd: FloatArray  # (n,): of every pixel, before compression, as level
+    pixels: CompressedPixels | None  # None: not compressed
+    deviations: FloatArray  # (64 b,): of the coefficients, which they determine
+
+    @classmethod
+    def of(cls, sd: FloatArray, pixels: CompressedPixels | None) -> ObservedNoise:
+        """Determine the deviations of the coefficients."""
+        return cls(sd, pixels, np.empty(0) if pixels is None else pixels.deviations(sd))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,14 +120,15 @@ def _adjusted(fit: DiscFit, pixels: CompressedPixels, noise_share: float) -> Com
         return None
     sd = fit.sd.copy()
     sd[pixels.in_blocks] *= noise_share
+    noise = ObservedNoise.of(sd, pixels)
     try:
-        now = compressed_fit_at(fit.sample, fit.state, fit.free, sd, pixels)
+        now = compressed_fit_at(fit.sample, fit.state, fit.free, noise)
         for _ in range(_STEPS):
             step, promised = newton_step(now, 0.0)
             if promised < _LEAST_PROMISE:
                 break
             state = now.state.moved(step, fit.free.tone)
-            trial = compressed_fit_at(fit.sample, state, fit.free, sd, pixels)
+            trial = compressed_fit_at(fit.sample, state, fit.free, noise)
             if not _total(trial) <= _total(now):
                 break
             now = trial
@@ -153,7 +169,10 @@ def _noise_share(fits: Sequence[DiscFit], pixels: Sequence[CompressedPixels]) ->
         free = fit.free
         of_prior = np.linalg.solve(fit.normal, free.precision[np.ix_(free.rows, free.rows)])
         determined = len(free.rows) - float(np.trace(of_prior))
-        losses += [of_disc.misfit(fit.levels, share * fit.sd).total for share in _NOISE_SHARES]
+        losses += [
+            of_disc.misfit(fit.levels, of_disc.deviations(share * fit.sd)).total
+            for share in _NOISE_SHARES
+        ]
         losses -= determined * np.log(_NOISE_SHARES)
     best = int(np.clip(np.argmin(losses), 1, len(losses) - 2))
     left, middle, right = losses[best - 1 : best + 2].tolist()
@@ -175,35 +194,32 @@ def pixels_before_compression(sample: DiscSample, steps: FloatArray) -> Compress
 
 
 def compressed_fit_at(
-    sample: DiscSample,
-    state: DiscState,
-    free: DiscUnknowns,
-    sd: FloatArray,
-    pixels: CompressedPixels | None,
+    sample: DiscSample, state: DiscState, free: DiscUnknowns, noise: ObservedNoise
 ) -> DiscFit:
-    """Return a fit linearised at a state, with the noise (n,) before compression.
+    """Return a fit linearised at a state, with given noise.
 
     Misfit and scaled Jacobian are those of the coefficients, followed by those of pixels whose
     block is clipped or not whole.
     """
-    fit = disc_fit_at(sample, state, free, sd)
+    pixels, sd, deviations = noise.pixels, noise.sd, noise.deviations
     if pixels is None:
-        return fit
+        return disc_fit_at(sample, state, free, sd)
+    share, levels, jacobian = linearised_at(sample, state)
     alone, clips = pixels.outside_blocks, sample.censoring
     clips = replace(clips, at_high=clips.at_high[alone], at_low=clips.at_low[alone])
-    of_blocks = pixels.misfit(fit.levels, sd)
-    of_alone = misfit(sample.levels[alone], fit.levels[alone], sd[alone], clips)
+    of_blocks = pixels.misfit(levels, deviations)
+    of_alone = misfit(sample.levels[alone], levels[alone], sd[alone], clips)
     both = Misfit(
         of_blocks.total + of_alone.total,
         np.concatenate((of_blocks.score, of_alone.score)),
         np.concatenate((of_blocks.weight, of_alone.weight)),
     )
-    rows = fit.jacobian[free.rows]
-    by_coefficients = pixels.coefficients(rows) / pixels.deviations(sd)
+    rows = jacobian[free.rows]
+    by_coefficients = pixels.coefficients(rows) / deviations
     scaled = np.hstack((by_coefficients, rows[:, alone] / sd[alone]))
     normal = weighted_products(scaled, both.weight, np.zeros(len(free.rows)))
     normal += free.precision[np.ix_(free.rows, free.rows)]
-    return replace(fit, misfit=both, scaled=scaled, normal=normal)
+    return DiscFit(sample, free, state, share, levels, jacobian, sd, both, scaled, normal)
 
 
 def noise_before_compression(fit: DiscFit, pixels: CompressedPixels | None) -> FloatArray:

@@ -468,12 +468,12 @@ def fit_disc(sample: DiscSample, start: DiscState, free: DiscUnknowns) -> DiscFi
     state, free = start, sample.unknowns(free)
     if len(sample.levels) < len(free.rows):  # other edges reach all other pixels
         raise NoFit
-    linear = _linearised(sample, state)
+    linear = linearised_at(sample, state)
     sd = _noise(sample, linear.share, linear.levels).sd
     seen = ~sample.censoring.is_clipped
     for _ in range(_NOISE_ROUNDS):
         fit = _minimise(sample, state, free, sd, linear)
-        state, linear = fit.state, _Linear(fit.share, fit.levels, fit.jacobian)
+        state, linear = fit.state, Linear(fit.share, fit.levels, fit.jacobian)
         before, sd = sd, fit.noise.sd
         changes = np.abs(np.log(sd[seen] / before[seen]))
         if changes.sum() <= _SETTLED_NOISE * len(changes):
@@ -481,7 +481,7 @@ def fit_disc(sample: DiscSample, start: DiscState, free: DiscUnknowns) -> DiscFi
     return fit
 
 
-class _Linear(NamedTuple):
+class Linear(NamedTuple):
     """The image model about a state."""
 
     share: FloatArray  # (n,): white share
@@ -494,10 +494,10 @@ def disc_fit_at(
     state: DiscState,
     free: DiscUnknowns,
     sd: FloatArray,
-    linear: _Linear | None = None,
+    linear: Linear | None = None,
 ) -> DiscFit:
     """Return a fit linearised at a state, with given noise (n,); `linear`: if that is known."""
-    share, levels, jacobian = linear or _linearised(sample, state)
+    share, levels, jacobian = linear or linearised_at(sample, state)
     current = misfit(sample.levels, levels, sd, sample.censoring)
     scaled = scaled_rows(jacobian, free.rows, sd)
     normal = weighted_products(scaled, current.weight, np.zeros(len(free.rows)))
@@ -505,20 +505,16 @@ def disc_fit_at(
     return DiscFit(sample, free, state, share, levels, jacobian, sd, current, scaled, normal)
 
 
-def misfit_by(fit: DiscFit, sd: FloatArray) -> float:
-    """Return the negative log-likelihood of a fit's pixels with given noise, up to a constant."""
-    return misfit(fit.sample.levels, fit.levels, sd, fit.sample.censoring).total
-
-
 def noise_at(sample: DiscSample, state: DiscState) -> GreyNoise:
     """Return the noise that the residuals of a state show, which need not be fitted."""
-    linear = _linearised(sample, state)
+    linear = linearised_at(sample, state)
     return _noise(sample, linear.share, linear.levels)
 
 
-def _linearised(sample: DiscSample, state: DiscState) -> _Linear:
+def linearised_at(sample: DiscSample, state: DiscState) -> Linear:
+    """Return the image model about a state."""
     share = sample.pixels.white_share(state.geometry, state.blur)
-    return _Linear(share.value, *sample.level_model.linearised(share, state.vector))
+    return Linear(share.value, *sample.level_model.linearised(share, state.vector))
 
 
 def _noise(
@@ -565,7 +561,7 @@ def _noise(
 
 
 def _minimise(
-    sample: DiscSample, state: DiscState, free: DiscUnknowns, sd: FloatArray, linear: _Linear
+    sample: DiscSample, state: DiscState, free: DiscUnknowns, sd: FloatArray, linear: Linear
 ) -> DiscFit:
     """Take damped Gauss-Newton steps (Levenberg-Marquardt) from a linearised state."""
     fit, damping = disc_fit_at(sample, state, free, sd, linear), _DAMPING

@@ -15,6 +15,7 @@ import numpy as np
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.measurement.discs.affine_model import mean_radius_px
 from kgcp.measurement.discs.compressed_fit import (
+    ObservedNoise,
     compressed_fit_at,
     noise_before_compression,
     pixels_before_compression,
@@ -28,11 +29,11 @@ from kgcp.measurement.discs.fit_disc import (
     DiscUnknowns,
     NoFit,
     ProcessingPrior,
-    misfit_by,
     noise_at,
 )
 from kgcp.measurement.discs.tone_curve import WAVES, wave_limits
 from kgcp.measurement.image_model.compression import CompressedPixels
+from kgcp.measurement.image_model.noise import misfit
 from kgcp.measurement.image_model.photometry import Tone
 
 _STEPS, _NOISE_ROUNDS = 25, 2
@@ -135,7 +136,7 @@ def adjust_together(
         own_sds = [noise_at(*pair).sd for pair in zip(samples, states, strict=True)]
         fits = _minimised(samples, states, free, usual, own_sds)
         states = [fit.state for fit in fits]
-    loss = sum(misfit_by(fit, sd) for fit, sd in zip(fits, sds, strict=True))
+    loss = sum(_misfit_by(fit, sd) for fit, sd in zip(fits, sds, strict=True))
     loss += _penalty(fits[0].state.vector[_SHARED], usual)
     return _joint(fits, sharpening_px, loss, is_settled=True)
 
@@ -235,9 +236,10 @@ def _minimised(
     """
     pixels = [None] * len(samples) if pixels is None else pixels
     frees = [sample.unknowns(free) for sample in samples]
+    noises = [ObservedNoise.of(*of_disc) for of_disc in zip(sds, pixels, strict=True)]
 
     def at(places: Sequence[DiscState]) -> list[DiscFit]:
-        each = zip(samples, places, frees, sds, pixels, strict=True)
+        each = zip(samples, places, frees, noises, strict=True)
         return [compressed_fit_at(*of_disc) for of_disc in each]
 
     def moved(fits: Sequence[DiscFit], steps: FloatArray) -> list[DiscFit]:
@@ -281,6 +283,11 @@ def _own_total(fit: DiscFit) -> float:
 def _total(fits: Sequence[DiscFit], usual: ProcessingPrior) -> float:
     own = sum(_own_total(fit) for fit in fits)
     return own + _penalty(fits[0].state.vector[_SHARED], usual)
+
+
+def _misfit_by(fit: DiscFit, sd: FloatArray) -> float:
+    """Return the negative log-likelihood of a fit's pixels with given noise, up to a constant."""
+    return misfit(fit.sample.levels, fit.levels, sd, fit.sample.censoring).total
 
 
 def _penalty(shared: FloatArray, usual: ProcessingPrior) -> float:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -27,7 +29,7 @@ from kgcp.measurement.discs.camera_tone import (
     unknowns_of_disc,
 )
 from kgcp.measurement.discs.comparison import measure_by_centroid, measure_by_gaussian
-from kgcp.measurement.discs.compressed_fit import adjust_to_intervals
+from kgcp.measurement.discs.compressed_fit import CompressedFit, adjust_to_intervals
 from kgcp.measurement.discs.covariance import (
     DiscScatter,
     inflations,
@@ -48,6 +50,8 @@ from kgcp.measurement.discs.records import (
 from kgcp.measurement.discs.ring_unknowns import RingUnknowns
 from kgcp.measurement.discs.textured_ground import fit_on_texture
 from kgcp.measurement.image_model.compression import quantisation_steps
+
+_Result = TypeVar("_Result")
 
 _LARGEST_SD_PX = 1.0  # of the centre, and of the moments divided by the radius
 # A disc's window reaches no farther beyond its outline than the smaller of these
@@ -162,9 +166,14 @@ def _measured(
         measure = measure_by_centroid if operator is Operator.CENTROID else measure_by_gaussian
         return [_refuse_uncertain(measure(task)) for task in tasks]
     camera = learn_tone([tasks], response) if camera is None else camera
-    outcomes = [_fitted(task, camera) for task in tasks]
-    if steps is not None:
-        outcomes = _adjusted_to_intervals(outcomes, steps)
+    adjusted = [_or_miss(task, partial(_adjusted, task, camera)) for task in tasks]
+    compressed = {} if steps is None else _adjusted_to_intervals(adjusted, steps)
+    outcomes = [
+        each
+        if isinstance(each, DiscMiss)
+        else _or_miss(task, partial(_with_scatter, task, each, compressed.get(index)))
+        for index, (task, each) in enumerate(zip(tasks, adjusted, strict=True))
+    ]
     fits = [each for each in outcomes if not isinstance(each, DiscMiss)]
     factors = iter(inflations([scatter for _, scatter in fits]).tolist())
     return [
@@ -175,44 +184,59 @@ def _measured(
     ]
 
 
-def _fitted(task: DiscTask, camera: CameraTone) -> tuple[DiscFit, DiscScatter] | DiscMiss:
+def _or_miss(task: DiscTask, step: Callable[[], _Result]) -> _Result | DiscMiss:
+    """Return the result of a step of the measurement, or why there is none."""
     try:
-        fit = adjust_disc_in_any_light(
-            task, unknowns_of_disc(task, camera), first_blur_px(task, camera)
-        )
-        check_disc_fit(fit, task.outline)
-        if len(task.inner):
-            return _with_ring_unknowns(fit)
-        scatter = scatter_of(fit)
-        return (fit, scatter) if task.is_ground_even else fit_on_texture(fit, scatter, task.others)
+        return step()
     except DiscRejection as rejection:
         return DiscMiss(task.outline, rejection.reason, rejection.detail)
     except (NoFit, np.linalg.LinAlgError):
         return DiscMiss(task.outline, DiscReason.POOR_FIT, "singular equations")
 
 
-def _adjusted_to_intervals(
-    outcomes: list[tuple[DiscFit, DiscScatter] | DiscMiss], steps: FloatArray
-) -> list[tuple[DiscFit, DiscScatter] | DiscMiss]:
-    """Return the outcomes, with discs adjusted to the intervals of rounded coefficients.
+def _adjusted(task: DiscTask, camera: CameraTone) -> DiscFit:
+    fit = adjust_disc_in_any_light(
+        task, unknowns_of_disc(task, camera), first_blur_px(task, camera)
+    )
+    check_disc_fit(fit, task.outline)
+    return fit
 
-    Burnt discs stay as they are: most of their blocks have no certain coefficients. So do discs
-    that the coefficients do not determine.
+
+def _adjusted_to_intervals(
+    outcomes: Sequence[DiscFit | DiscMiss], steps: FloatArray
+) -> dict[int, CompressedFit]:
+    """Return, by their indices, the discs that the intervals of rounded coefficients determine.
+
+    Burnt discs are left out: most of their blocks have no certain coefficients.
     """
-    measured = {
-        index: each[0]
+    fits = {
+        index: each
         for index, each in enumerate(outcomes)
-        if not isinstance(each, DiscMiss) and not each[0].sample.is_burnt
+        if not isinstance(each, DiscMiss) and not each.sample.is_burnt
     }
-    if not measured:
-        return outcomes
-    adjusted = list(outcomes)
-    refined = adjust_to_intervals(list(measured.values()), steps)
-    for index, compressed in zip(measured, refined, strict=True):
-        if compressed is not None:
-            with suppress(np.linalg.LinAlgError):
-                adjusted[index] = (compressed.fit, scatter_of(compressed))
-    return adjusted
+    if not fits:
+        return {}
+    refined = zip(fits, adjust_to_intervals(list(fits.values()), steps), strict=True)
+    return {index: fit for index, fit in refined if fit is not None}
+
+
+def _with_scatter(
+    task: DiscTask, fit: DiscFit, compressed: CompressedFit | None
+) -> tuple[DiscFit, DiscScatter]:
+    """Return the final fit of a disc, and what its residuals say of the covariance.
+
+    Parameters
+    ----------
+    compressed : CompressedFit, optional
+        The same disc, adjusted to the intervals of rounded coefficients.
+    """
+    if compressed is not None:
+        with suppress(np.linalg.LinAlgError):
+            return compressed.fit, scatter_of(compressed)
+    if len(task.inner):
+        return _with_ring_unknowns(fit)
+    scatter = scatter_of(fit)
+    return (fit, scatter) if task.is_ground_even else fit_on_texture(fit, scatter, task.others)
 
 
 def _with_ring_unknowns(fit: DiscFit) -> tuple[DiscFit, DiscScatter]:

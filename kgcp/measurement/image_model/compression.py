@@ -176,7 +176,7 @@ class CompressedPixels:
         height, width = (side // _SIDE * _SIDE for side in grey.shape)
         number = y // _SIDE * (width // _SIDE) + x // _SIDE
         within = (x < width) & (y < height)
-        which = np.unique(number[within])
+        which, place = np.unique(number[within], return_inverse=True)
         rows, columns = np.divmod(which, max(width // _SIDE, 1))
         down, across = np.mgrid[:_SIDE, :_SIDE]
         block_values = grey[
@@ -192,10 +192,8 @@ class CompressedPixels:
         exact = ~is_clipped | (error < _MAX_DECODING_ERROR_COUNTS)
         before_clipping = np.where(is_clipped[:, None, None], decoded, block_values)[exact]
         middle = middle[exact]
-        place = np.full(height * width // _SIDE**2, -1)
-        place[which[exact]] = np.arange(np.count_nonzero(exact))
         block = np.full(len(x), -1)
-        block[within] = place[number[within]]
+        block[within] = np.where(exact, np.cumsum(exact) - 1, -1)[place]
         in_blocks = np.flatnonzero(block >= 0)
         flat = _SIDE**2 * block + _SIDE * (y % _SIDE) + x % _SIDE
         return cls(
@@ -207,15 +205,20 @@ class CompressedPixels:
             middle + 0.5 * steps,
         )
 
-    def misfit(self, model: FloatArray, sd: FloatArray) -> Misfit:
-        """Compare the coefficients with modelled levels (n,) under noise `sd` (n,).
+    def misfit(self, model: FloatArray, deviations: FloatArray) -> Misfit:
+        """Compare the coefficients with modelled levels (n,).
 
-        Score and weight are those of the coefficients (64 b,), in units of `deviations`. As for
-        grey values (`kgcp.measurement.image_model.noise`), the loss grows as the logarithm beyond
-        3.5 standard deviations.
+        Score and weight are those of the coefficients (64 b,), in units of their standard
+        deviations. As for grey values (`kgcp.measurement.image_model.noise`), the loss grows as the
+        logarithm beyond 3.5 standard deviations.
+
+        Parameters
+        ----------
+        deviations : (64 b,) array
+            Result of `deviations`.
         """
-        mean, deviation = self._expected(model, sd)
-        return Misfit(*_misfit(*(each.ravel() for each in (mean, deviation, self.low, self.high))))
+        mean = self._expected(model).ravel()
+        return Misfit(*_misfit(mean, deviations, self.low.ravel(), self.high.ravel()))
 
     def deviations(self, sd: FloatArray) -> FloatArray:
         """Return the standard deviations (64 b,) of coefficients under noise `sd` (n,).
@@ -257,7 +260,8 @@ class CompressedPixels:
         variance : (n,) array
             Their variances; 0 for observed ones.
         """
-        mean, deviation = self._expected(model, sd)
+        mean = self._expected(model)
+        deviation = self.deviations(sd).reshape(mean.shape)
         expected, left = _within(mean, deviation, self.low, self.high)
         square = _COSINES * _COSINES
         before, variance = levels.copy(), np.zeros(len(levels))
@@ -265,12 +269,11 @@ class CompressedPixels:
         variance[self.in_blocks] = (square.T @ left @ square).ravel()[self.places] / _WHITE**2
         return before, variance
 
-    def _expected(self, model: FloatArray, sd: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return modelled means and standard deviations of coefficients, each (b, 8, 8)."""
+    def _expected(self, model: FloatArray) -> FloatArray:
+        """Return the modelled coefficients (b, 8, 8)."""
         values = self.observed.ravel().copy()
         values[self.places] = _WHITE * np.clip(model[self.in_blocks], 0.0, 1.0)
-        mean = _transformed(values.reshape(self.observed.shape))
-        return mean, self.deviations(sd).reshape(mean.shape)
+        return _transformed(values.reshape(self.observed.shape))
 
 
 def _within(

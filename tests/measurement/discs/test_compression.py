@@ -21,6 +21,7 @@ from kgcp.measurement.discs import joint_tone
 from kgcp.measurement.discs.adjust_disc import DiscTask, adjust_disc
 from kgcp.measurement.discs.camera_tone import learn_tone
 from kgcp.measurement.discs.compressed_fit import (
+    ObservedNoise,
     compressed_fit_at,
     noise_before_compression,
     pixels_before_compression,
@@ -222,16 +223,17 @@ def test_the_likelihood_of_coefficients_agrees_with_its_derivatives() -> None:
     fit = fits[int(np.argmax([len(each) for each in alone]))]
     pixels = pixels_before_compression(fit.sample, steps)
     assert len(pixels.outside_blocks) > 0
+    noise = ObservedNoise.of(fit.sd, pixels)
     for row, step in ((0, 1e-5), (2, 1e-5), (int(Row.WHITE), 1e-6), (int(Row.SHARPENING), 1e-5)):
         moved = np.zeros(len(fit.state.vector))
         moved[row] = step
         totals = [
             compressed_fit_at(
-                fit.sample, DiscState(fit.state.vector + sign * moved), fit.free, fit.sd, pixels
+                fit.sample, DiscState(fit.state.vector + sign * moved), fit.free, noise
             ).misfit.total
             for sign in (1.0, -1.0)
         ]
-        made = compressed_fit_at(fit.sample, fit.state, fit.free, fit.sd, pixels)
+        made = compressed_fit_at(fit.sample, fit.state, fit.free, noise)
         number = int(np.flatnonzero(fit.free.rows == row)[0])
         slope = -float(made.scaled[number] @ made.misfit.score)
         assert (totals[0] - totals[1]) / (2.0 * step) == pytest.approx(slope, rel=0.02, abs=0.5)
@@ -242,15 +244,17 @@ def test_a_coefficient_contributes_only_the_information_of_its_interval() -> Non
     photo = compressed(small_discs(FILM, 5, 1)[0], 92)
     places = np.mgrid[16:24, 16:24].reshape(2, -1)[::-1].astype(np.float64)
     model, sd = photo[16:24, 16:24].ravel() / 255.0, np.full(64, 1.0 / 255.0)
-    wide = CompressedPixels.of(photo, places, np.full((8, 8), 1000.0)).misfit(model, sd)
+    unlimited = CompressedPixels.of(photo, places, np.full((8, 8), 1000.0))
+    wide = unlimited.misfit(model, unlimited.deviations(sd))
     assert np.abs(wide.score).max() < 1e-6
     assert wide.weight.max() < 1e-6
     fine = CompressedPixels.of(photo, places, np.full((8, 8), 0.01))
     errors = np.random.default_rng(1).uniform(-1.0, 1.0, 64)
-    off = fine.misfit(model + (errors - errors.mean()) / 255.0, sd)
+    deviations = fine.deviations(sd)
+    off = fine.misfit(model + (errors - errors.mean()) / 255.0, deviations)
     assert off.weight == pytest.approx(1.0, abs=1e-3)
     assert off.score @ off.score == pytest.approx(64 * errors.var(), rel=0.01)
-    outlying = fine.misfit(model + 20.0 / 255.0, sd)  # all of it in the first coefficient
+    outlying = fine.misfit(model + 20.0 / 255.0, deviations)  # all of it in the first coefficient
     assert abs(outlying.score[0]) == pytest.approx(3.5**2 / 160.0, rel=0.02)
 
 
