@@ -58,6 +58,23 @@ def test_the_tabulated_curve_equals_srgb() -> None:
 
 
 @pytest.mark.parametrize("tone", [Tone.UNKNOWN, Tone.UNKNOWN_OVER_LINE])
+def test_grey_values_and_waves_are_those_of_the_curve(tone: Tone) -> None:
+    """The compiled series agree with library functions, also beyond black and white."""
+    light = np.linspace(-0.1, 1.4, 200)
+    offsets, share = np.zeros((2, 200)), WhiteShare(np.zeros((15, 200)), light, np.zeros((11, 200)))
+    values, waves = np.zeros(COUNT), np.array((0.1, -0.5, 0.05))
+    values[Row.WHITE] = 1.0
+    values[Row.WAVE_1 : Row.SHARPENING] = waves
+    found, jacobian = LevelModel(offsets, tone, None).linearised(share, values)
+    curve = DiscTone(tone)
+    tolerance = 1e-6 if tone.is_srgb else 1e-14  # sRGB's curve is a table
+    assert np.abs(found - curve.bent(waves).levels(light)).max() < tolerance
+    for row, wave in zip(jacobian[Row.WAVE_1 : Row.SHARPENING], np.eye(3), strict=True):
+        difference = curve.bent(wave).levels(light) - curve.levels(light)
+        assert np.abs(row - difference).max() < tolerance
+
+
+@pytest.mark.parametrize("tone", [Tone.UNKNOWN, Tone.UNKNOWN_OVER_LINE])
 def test_every_level_can_be_converted_to_light(tone: Tone) -> None:
     curve = DiscTone(tone, (0.2, -0.6, 0.1))
     light = np.linspace(-0.1, 1.6, 50)
