@@ -22,6 +22,7 @@ from kgcp.quality.checks.frame_header import FrameHeader
 _WORDS = {
     "sbet": "SBET",
     "rtklib": "RTKLIB solution",
+    "waypoint": "Waypoint export",
     "csv": "CSV table",
     "tum": "TUM trajectory",
 }
@@ -56,14 +57,18 @@ def _trajectory_parts(
     start = first_epoch(file)
     name = contents.relative(file.path)
     layout_keys, layout_text = _layout(file)
-    attitude_keys, attitude_text = _attitude(file)
+    attitude_keys, attitude_text = _attitude(start)
     text = f"{name}: {_WORDS[file.format]}{layout_text}{attitude_text}"
     yield InitFinding("trajectory", text)
     yield DraftKey("trajectory", name, f"{_WORDS[file.format]}, recognised by its content")
     yield from layout_keys
     if start is None:
         yield Gap("trajectory", f"{name} cannot be read", "run kgcp check, which says why")
-    elif start.crs is not None and file.format not in {"sbet", "rtklib"}:  # these always have it
+    elif start.crs is not None and file.format not in {
+        "sbet",
+        "rtklib",
+        "waypoint",
+    }:  # these always have it
         yield DraftKey("crs", start.crs, "x, y are longitude and latitude")
     yield from _time_parts(file, start, times_s)
     if file.format == "sbet" and contents.accuracies:
@@ -281,11 +286,10 @@ def _zone_parts(text: str, named: TimeSystem | None) -> Iterator[Part]:
     )
 
 
-def _attitude(file: TrajectoryFile) -> tuple[tuple[DraftKey, ...], str]:
-    has_attitude = file.format in {"sbet", "tum"} or (
-        file.table is not None and file.table.has_attitude
-    )
-    if has_attitude:
+def _attitude(start: FirstEpoch | None) -> tuple[tuple[DraftKey, ...], str]:
+    if start is None:
+        return (), ""
+    if start.has_attitude:
         return (), "; with attitude"
     keys = (
         DraftKey(

@@ -20,6 +20,7 @@ from kgcp.io.formats.rtklib_pos import looks_like_solution
 from kgcp.io.formats.trajectories import sbet, tum
 from kgcp.io.formats.trajectories.first_epoch import TrajectoryFile
 from kgcp.io.formats.trajectories.foreign_csv import recognised_table
+from kgcp.io.formats.waypoint_export import looks_like_waypoint
 from kgcp.io.images.frames import FRAME_SUFFIXES, RESULTS_NAME, list_frames
 
 FLIGHT_TOML = "flight.toml"
@@ -172,6 +173,8 @@ def _kinds_of_log(file: ForeignFile) -> _Kinds:
     if b"\0" not in file.head and file.head.strip() and looks_like_solution(file):
         is_events = name.endswith(_EVENTS)
         return (("events", None) if is_events else ("trajectory", TrajectoryFile(path, "rtklib")),)
+    if looks_like_waypoint(file):
+        return (("trajectory", TrajectoryFile(path, "waypoint")),)
     return ()
 
 

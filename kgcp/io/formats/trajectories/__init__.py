@@ -22,8 +22,9 @@ from kgcp.io.files.csv_columns import SEPARATOR_REMEDY
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.registry import Registry
 from kgcp.io.formats.rtklib_pos import looks_like_solution
-from kgcp.io.formats.trajectories import csv, rtklib, sbet, tum
+from kgcp.io.formats.trajectories import csv, rtklib, sbet, tum, waypoint
 from kgcp.io.formats.trajectories.records import Epochs, TrajectoryFileOptions
+from kgcp.io.formats.waypoint_export import looks_like_waypoint
 
 FORMATS: Registry[Callable[[ForeignFile, TrajectoryFileOptions, str], Epochs]] = Registry(
     "a trajectory",
@@ -31,6 +32,7 @@ FORMATS: Registry[Callable[[ForeignFile, TrajectoryFileOptions, str], Epochs]] =
     {
         "sbet": (sbet.matches, sbet.read),
         "rtklib": (looks_like_solution, rtklib.read),
+        "waypoint": (looks_like_waypoint, waypoint.read),
         "csv": (csv.matches, csv.read),
         "tum": (tum.matches, tum.read),
     },

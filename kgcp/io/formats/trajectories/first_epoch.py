@@ -14,6 +14,8 @@ from kgcp.io.formats.rtklib_pos import read_solution
 from kgcp.io.formats.trajectories.foreign_csv import ForeignTable
 from kgcp.io.formats.trajectories.rtklib import GEOCENTRIC
 from kgcp.io.formats.trajectories.sbet import first_record
+from kgcp.io.formats.trajectories.waypoint import PLACE, has_attitude, time_columns
+from kgcp.io.formats.waypoint_export import read_export
 
 _GEODETIC, _ECEF = ("longitude", "latitude"), ("x-ecef", "y-ecef", "z-ecef")
 
@@ -35,6 +37,7 @@ class FirstEpoch:
     y: float
     crs: str | None  # of x, y, for pyproj; None: the file does not say
     time: str  # as in the file; empty if the format defines day and time system
+    has_attitude: bool
 
 
 def first_epoch(file: TrajectoryFile) -> FirstEpoch | None:
@@ -44,19 +47,20 @@ def first_epoch(file: TrajectoryFile) -> FirstEpoch | None:
             return _of_sbet(file.path)
         if file.format == "rtklib":
             return _of_solution(file.path)
+        if file.format == "waypoint":
+            return _of_waypoint(file.path)
         if file.table is not None:
             return _of_table(file.table)
         words = ForeignFile(file.path, "").first_line.split()
-        return FirstEpoch(float(words[1]), float(words[2]), None, words[0])
+        return FirstEpoch(float(words[1]), float(words[2]), None, words[0], has_attitude=True)
     except (KgcpError, LookupError, ValueError):
         return None
 
 
 def _of_sbet(path: Path) -> FirstEpoch:
     seconds, latitude, longitude = first_record(path)[:3].tolist()
-    return FirstEpoch(
-        float(np.degrees(longitude)), float(np.degrees(latitude)), WGS84_3D, repr(seconds)
-    )
+    longitude, latitude = np.degrees((longitude, latitude)).tolist()
+    return FirstEpoch(longitude, latitude, WGS84_3D, repr(seconds), has_attitude=True)
 
 
 def _of_solution(path: Path) -> FirstEpoch:
@@ -66,7 +70,15 @@ def _of_solution(path: Path) -> FirstEpoch:
     else:
         place = np.array([columns[name][0] for name in _ECEF])
         longitude, latitude = wgs84_from_map(GEOCENTRIC, [place], path.name)[0, :2].tolist()
-    return FirstEpoch(longitude, latitude, WGS84_3D, "")
+    return FirstEpoch(longitude, latitude, WGS84_3D, "", has_attitude=False)
+
+
+def _of_waypoint(path: Path) -> FirstEpoch:
+    export = read_export(ForeignFile(path, "[vehicle] trajectory"))
+    longitude, latitude = (float(export.numbers(name, "deg")[0]) for name in PLACE[:2])
+    columns = time_columns(export)
+    time = "" if columns.has_days else export.columns[columns.time].texts[0]
+    return FirstEpoch(longitude, latitude, WGS84_3D, time, has_attitude=has_attitude(export))
 
 
 def _of_table(foreign: ForeignTable) -> FirstEpoch | None:
@@ -75,4 +87,4 @@ def _of_table(foreign: ForeignTable) -> FirstEpoch | None:
         return None
     crs = WGS84_3D if foreign.is_geographic else None
     time = foreign.table.cells["time"].replace(foreign.table.layout.decimal, ".")
-    return FirstEpoch(x, y, crs, time)
+    return FirstEpoch(x, y, crs, time, foreign.has_attitude)

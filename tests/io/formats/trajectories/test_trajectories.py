@@ -238,6 +238,7 @@ def test_a_point_that_cannot_be_transformed_is_named(tmp_path: Path) -> None:
         ("\n%  GPST  latitude(deg)\n", "rtklib"),
         ("2015/06/01 00:00:00.000   47.48 19.05\n", "rtklib"),
         ("# x\n\n1 2 3 4 5 6 7 8\n", "tum"),
+        ("Project: x\nProgram:     GrafNav Version 9.00\n", "waypoint"),
         (struct.pack("<17d", 5.0, 0.7, 0.03, 99.0, *[0.0] * 13), "sbet"),
     ],
 )
@@ -257,6 +258,7 @@ def test_the_format_may_be_named_instead(tmp_path: Path) -> None:
         ("csv", "lacks the columns"),
         ("tum", "line 1: is not the eight numbers"),
         ("rtklib", "lacks the header line"),
+        ("waypoint", "lacks the lines with the names of its columns"),
         ("sbet", f"{path.stat().st_size} bytes, not a multiple of 136"),
     ):
         with pytest.raises(KgcpError, match=words):
@@ -284,6 +286,16 @@ _SAME_PLACES: dict[str, tuple[bytes, TrajectoryFileOptions]] = {
             b" height(m) Q\n2417 120618.0 45.0 9.0 100.0 1\n2417 120618.5 45.00001 9.0 100.0 1\n"
         ),
         TrajectoryFileOptions(course_sd_deg=(2.0, 2.0, 3.0)),
+    ),
+    "waypoint": (
+        (
+            b"Program:     Inertial Explorer Version 8.90\nDatum: WGS84, (processing datum)\n\n"
+            b"   Week  GPSTime Latitude Longitude H-Ell  Roll Pitch Heading\n"
+            b"(weeks)    (sec)    (deg)     (deg)   (m) (deg) (deg)   (deg)\n"
+            b"   2417 120618.0     45.0       9.0 100.0     0     0       0\n"
+            b"   2417 120618.5 45.00001       9.0 100.0     0     0       0\n"
+        ),
+        TrajectoryFileOptions(),
     ),
     "tum": (
         "".join(
