@@ -26,7 +26,6 @@ from kgcp.io.exporters.formats import DEFAULT_FORMATS, FORMATS
 if TYPE_CHECKING:
     from kgcp.georef.gcp import Gcp
     from kgcp.georef.selection import Selection
-    from kgcp.georef.target_positions import Vehicle
     from kgcp.io.flight.flight import Flight
     from kgcp.io.formats.exclusions import Exclusion
     from kgcp.io.images.remote import StoredFolder
@@ -389,7 +388,6 @@ def _report_part(part: GcpSet) -> None:
     for reason, times in _reasons(part).most_common():
         click.echo(f"  {times:6d} {reason}", err=True)
     _report_accuracy(part.gcps)
-    _report_deviations(part.vehicle)
     if part.consistency is not None:
         _report_consistency(part.consistency)
     print_doubts(part.doubts)
@@ -415,19 +413,6 @@ def _report_accuracy(gcps: Sequence[Gcp]) -> None:
     text = accuracy_text(gcps)
     if text:
         click.echo(text, err=True)
-
-
-def _report_deviations(vehicle: Vehicle | None) -> None:
-    if vehicle is not None and vehicle.motion.sd_position_m is None:
-        click.echo(
-            "the trajectory has no sd_x, sd_y, sd_z: KGCPs have no standard deviations", err=True
-        )
-    elif vehicle is not None and vehicle.motion.sd_attitude_deg is None:
-        click.echo(
-            "the trajectory has no sd_roll_deg, sd_pitch_deg, sd_heading_deg:"
-            " attitude is taken as exact",
-            err=True,
-        )
 
 
 def _report_consistency(found: Consistency) -> None:

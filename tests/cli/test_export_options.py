@@ -145,9 +145,8 @@ def test_corrections_that_a_doubt_withholds_are_not_advised(folder: Path) -> Non
     write_table(table, DETECTION_COLUMNS, ({**row, "inner_growth": 0.02} for row in rows), {})
     printed = json.loads(_export(folder, "--json").stdout)
     saved = json.loads((folder / "kgcp" / "consistency.json").read_text(encoding="utf-8"))
-    (doubt,) = saved["doubts"]
-    assert doubt["code"] == "diameters"
-    assert printed["doubts"] == [doubt | {"flight": folder.name}]
+    assert "diameters" in {doubt["code"] for doubt in saved["doubts"]}
+    assert printed["doubts"] == [doubt | {"flight": folder.name} for doubt in saved["doubts"]]
     (line,) = printed["advice"]
     assert saved["advice"] == [line]
     assert line.endswith("no correction is offered, because a doubt names a likelier cause")

@@ -1,4 +1,4 @@
-"""Checks of standard deviations: those that are 0, in another unit, or too small."""
+"""Checks of standard deviations: those that are missing, 0, in another unit, or too small."""
 
 from __future__ import annotations
 
@@ -34,11 +34,12 @@ _POSES_REMEDY = "give those of the adjustment, or remove their columns from the 
 def check_deviations(motion: Motion) -> Iterator[Doubt]:
     """Yield doubts about standard deviations of a trajectory.
 
-    These are epochs whose position or attitude counts as exact, deviations that seem to be in
-    millimetres or to be variances, and those that are smaller than the positions' scatter.
+    They may be missing, 0, in millimetres or variances, or smaller than the positions' scatter.
     """
     sd_m = motion.sd_position_m
-    if sd_m is not None:
+    if sd_m is None:
+        yield _missing("positions", "points will have none")
+    else:
         effect = "points there are weighted far too much"
         is_zero = np.any(sd_m == 0.0, axis=1)
         yield from _zeros(is_zero, "trajectory's positions", "epochs", effect, _REMEDY)
@@ -49,11 +50,23 @@ def check_deviations(motion: Motion) -> Iterator[Doubt]:
             yield _in_another_unit(usual_m.max(), "which suggests millimetres")
         elif usual_m.min() > 0.0:
             yield from _scatter(motion, float(np.linalg.norm(usual_m)))
-    if motion.sd_attitude_deg is not None:
+    if motion.sd_attitude_deg is None and sd_m is not None:
+        yield _missing("attitudes", "the lever arm's direction counts as exact")
+    elif motion.sd_attitude_deg is not None:
         effect = "the lever arm's direction counts as exact"
         # of all three angles: level ground may be known better than can be written
         is_zero = np.all(motion.sd_attitude_deg == 0.0, axis=1)
         yield from _zeros(is_zero, "trajectory's attitudes", "epochs", effect, _REMEDY)
+
+
+def _missing(of: str, effect: str) -> Doubt:
+    return mild(
+        Cause.STANDARD_DEVIATIONS,
+        f"the trajectory has no standard deviations of its {of}: {effect}",
+        "export the trajectory with them; those of an SBET are in a file of their own, which"
+        " [vehicle] accuracies names",
+        {},
+    )
 
 
 def _scatter(motion: Motion, stated_m: float) -> Iterator[Doubt]:

@@ -23,9 +23,16 @@ _MOTION = Motion(np.arange(5.0), np.zeros((5, 3)), np.tile(np.eye(3), (5, 1, 1))
 _POSES = ReferencePoses(tuple("abcde"), np.zeros((5, 3)), np.zeros((5, 3)), _SD, _SD[:, 0])
 
 
-def test_deviations_that_are_known_or_missing_raise_no_doubt() -> None:
+def test_deviations_that_are_missing_are_doubted() -> None:
+    (position,) = check_deviations(replace(_MOTION, sd_position_m=None, sd_attitude_deg=None))
+    (attitude,) = check_deviations(replace(_MOTION, sd_attitude_deg=None))
+    assert (position.code, position.is_grave) == (Cause.STANDARD_DEVIATIONS, False)
+    assert position.sentence.endswith("of its positions: points will have none")
+    assert attitude.sentence.endswith("of its attitudes: the lever arm's direction counts as exact")
+
+
+def test_deviations_that_are_known_raise_no_doubt() -> None:
     assert not [*check_deviations(_MOTION)]
-    assert not [*check_deviations(replace(_MOTION, sd_position_m=None, sd_attitude_deg=None))]
     level = _SD * [0.0, 0.0, 1.0]  # a flat yard, and heading by two antennas
     assert not [*check_deviations(replace(_MOTION, sd_attitude_deg=level))]
 
@@ -84,7 +91,8 @@ def _driven(rate_hz: float) -> Motion:
     position = np.column_stack((30.0 * np.cos(angle), 30.0 * np.sin(angle), 0.1 * time_s))
     position += np.random.default_rng(2).normal(0.0, 0.01, position.shape)
     turns = np.broadcast_to(np.eye(3), (len(time_s), 3, 3)).copy()
-    return Motion(time_s, position, turns, np.full_like(position, 0.02), None)
+    sd = np.full_like(position, 0.02)
+    return Motion(time_s, position, turns, sd, sd)
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 5.0, 20.0, 100.0])
