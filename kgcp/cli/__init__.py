@@ -49,9 +49,9 @@ _EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells count
 
 @contextmanager
 def _one_line_warnings() -> Iterator[None]:
-    """Print each `KgcpWarning` as one line; other warnings are shown as Python shows them."""
+    """Print each `KgcpWarning` once, as one line; leave other warnings to Python."""
     with warnings.catch_warnings():
-        show = warnings.showwarning
+        show, printed = warnings.showwarning, set[str]()
 
         def show_in_one_line(
             message: Warning | str,
@@ -63,7 +63,10 @@ def _one_line_warnings() -> Iterator[None]:
         ) -> None:
             """Write one of kgcp's warnings as a line; leave others as they are."""
             if issubclass(category, KgcpWarning):
-                click.echo(f"kgcp: warning: {message}", err=True)
+                text = f"kgcp: warning: {message}"
+                if text not in printed:
+                    click.echo(text, err=True)
+                printed.add(text)
             else:
                 show(message, category, filename, lineno, file, line)
 

@@ -92,6 +92,18 @@ def test_an_empty_frames_folder_is_a_one_line_error(flight: Path) -> None:
     assert not (flight / "kgcp").exists()
 
 
+def test_images_that_are_not_read_are_named_once(flight: Path) -> None:
+    """Unless the camera wrote a JPEG beside each of them, as it does with raw files."""
+    frames = flight / "frames"
+    first = next(frames.iterdir())
+    (frames / f"{first.stem}.DNG").write_bytes(b"raw")
+    result = run("detect", str(flight), "--jobs", "0", "--quiet")
+    assert "left out" not in result.stderr
+    (frames / "IMG_0001.HEIC").write_bytes(b"heic")
+    result = run("detect", str(flight), "--jobs", "0", "--quiet")
+    assert result.stderr.count("1 .heic files of a phone are left out, because") == 1
+
+
 @pytest.mark.parametrize("command", ["export-gcp", "bias-report"])
 def test_commands_that_need_detections_fail_in_one_line_before_detect(
     flight: Path, command: str

@@ -6,6 +6,7 @@ import fnmatch
 import os
 import re
 import sys
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -17,7 +18,7 @@ import cv2
 import numpy as np
 import simplejpeg
 
-from kgcp.errors import KgcpError, Reason, Rejection
+from kgcp.errors import KgcpError, KgcpWarning, Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.io.files.portable import scratch_file
@@ -122,6 +123,7 @@ def frames_among(names: Sequence[str], folder: str, remedy: str = CORRECT_FOLDER
     visible = [name for name in names if not any(part[0] == "." for part in name.split("/"))]
     frames = [name for name in visible if PurePosixPath(name).suffix.lower() in FRAME_SUFFIXES]
     if frames:
+        _warn_of_left_out(visible, frames, folder)
         return sorted(frames)
     counts = Counter(PurePosixPath(name).suffix.lower() for name in visible)
     counts.pop("", None)
@@ -134,6 +136,25 @@ def frames_among(names: Sequence[str], folder: str, remedy: str = CORRECT_FOLDER
     raise KgcpError(
         f"{folder}: holds no images that kgcp reads, but {count} {suffix} {kind}; {conversion}"
     )
+
+
+def _warn_of_left_out(names: Sequence[str], frames: Sequence[str], folder: str) -> None:
+    """Warn of images of a phone or raw files that have no frame of the same name beside them."""
+    read = {str(PurePosixPath(name).with_suffix("")) for name in frames}
+    left_out = Counter(
+        path.suffix.lower()
+        for path in map(PurePosixPath, names)
+        if path.suffix.lower() in _RAW_SUFFIXES | _PHONE_SUFFIXES
+        and str(path.with_suffix("")) not in read
+    )
+    for suffix, count in sorted(left_out.items()):
+        kind, conversion = kind_of(suffix)
+        warnings.warn(
+            f"{folder}: {count} {suffix} {kind} are left out, because kgcp does not read them;"
+            f" {conversion}",
+            KgcpWarning,
+            stacklevel=3,
+        )
 
 
 def matching_frames(frames: Sequence[str], patterns: Sequence[str]) -> list[str]:
