@@ -13,7 +13,6 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice, takewhile
-from pathlib import Path
 
 import numpy as np
 
@@ -52,11 +51,6 @@ class WaypointExport:
     scales: Mapping[str, str]  # of the standard deviations of `Position` and `Attitude`
     columns: Mapping[str, WaypointColumn]  # by the names in the file
 
-    @property
-    def path(self) -> Path:
-        """The file."""
-        return self.file.path
-
     def numbers(self, name: str, unit: str) -> FloatArray:
         """Return the numbers (n,) of a column; angles in `deg` may be written in D M S.
 
@@ -69,7 +63,7 @@ class WaypointExport:
         is_sexagesimal = unit == "deg" and _SEXAGESIMAL.fullmatch(f"({column.unit})") is not None
         if column.unit.lower() != unit and not is_sexagesimal:
             raise self.file.error(
-                f"gives {name} in {column.unit or 'no unit'}, not in {unit}", _AGAIN
+                f"gives {name} in {column.unit or 'no unit'}", f"export it in {unit}"
             )
         parse = _degrees if is_sexagesimal else float
         try:
@@ -105,7 +99,7 @@ def read_export(file: ForeignFile) -> WaypointExport:
     """
     rows = file.text.splitlines()
     below = next((i for i, row in enumerate(rows) if i and _UNITS.fullmatch(row)), None)
-    if below is None:
+    if below is None or not rows[below - 1].strip():
         raise file.error(
             "lacks the lines with the names of its columns and their units",
             "export it with its header",

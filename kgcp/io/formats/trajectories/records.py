@@ -68,6 +68,17 @@ class Epochs:
     sd_attitude_deg: FloatArray | None = None  # (n, 3): of roll, pitch, heading [deg]
 
 
+def true_covariances(written: FloatArray) -> FloatArray:
+    """Return covariances (n, 3, 3) as a file has them, with negative eigenvalues set to 0.
+
+    The rounding of its numbers can make a matrix that is not a covariance.
+    """
+    values, vectors = np.linalg.eigh(written)
+    if values.min() >= 0.0:
+        return written
+    return np.asarray((vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, -1, -2))
+
+
 def check_times(path: Path, time_s: FloatArray, place: Callable[[int], str]) -> None:
     """Refuse fewer than two epochs, or times that do not ascend.
 

@@ -13,7 +13,12 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.crs import WGS84_3D
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.rtklib_pos import RtklibSolution, read_solution
-from kgcp.io.formats.trajectories.records import Epochs, TrajectoryFileOptions, check_times
+from kgcp.io.formats.trajectories.records import (
+    Epochs,
+    TrajectoryFileOptions,
+    check_times,
+    true_covariances,
+)
 
 GEOCENTRIC = "EPSG:4978"
 _AS_HEIGHTS = "write the solution as latitude, longitude and height (out-solformat = llh)"
@@ -70,14 +75,10 @@ def _block(solution: RtklibSolution, names: tuple[str, ...]) -> FloatArray:
 def _covariances(deviations: FloatArray, roots: FloatArray) -> FloatArray:
     """Return covariances (n, 3, 3) of deviations (n, 3) and signed roots of xy, yz, zx (n, 3).
 
-    RTKLIB writes sign(c)·√|c| of a covariance c. Rounding to 0.1 mm can make a matrix that is not a
-    covariance. Its negative eigenvalues are then set to 0.
+    RTKLIB writes sign(c)·√|c| of a covariance c.
     """
     cov = np.zeros((len(deviations), 3, 3))
     cov[:, range(3), range(3)] = deviations**2
     for (row, column), root in zip(((0, 1), (1, 2), (2, 0)), roots.T, strict=True):
         cov[:, row, column] = cov[:, column, row] = np.copysign(root**2, root)
-    values, vectors = np.linalg.eigh(cov)
-    if values.min() >= 0.0:
-        return cov
-    return np.asarray((vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, -1, -2))
+    return true_covariances(cov)

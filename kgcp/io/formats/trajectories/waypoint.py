@@ -24,7 +24,12 @@ from kgcp.io.files.gps_time import (
     unwrap_week,
 )
 from kgcp.io.files.sniff import ForeignFile
-from kgcp.io.formats.trajectories.records import Epochs, TrajectoryFileOptions, check_times
+from kgcp.io.formats.trajectories.records import (
+    Epochs,
+    TrajectoryFileOptions,
+    check_times,
+    true_covariances,
+)
 from kgcp.io.formats.trajectories.times import times_from_week
 from kgcp.io.formats.waypoint_export import WaypointExport, read_export
 
@@ -44,6 +49,7 @@ _SECONDS, _CLOCK = "sec", "hms"
 _DATE_ORDERS = ("mdy", "dmy", "ymd")
 _HMS = re.compile(r"(\d{1,2}):(\d{1,2}):(\d{1,2}(?:\.\d*)?)")
 _DAY_S = 86400.0
+_GPS_YEAR = 1980  # in which it began; years of two digits are earlier
 _TIME_REMEDY = "export Week and GPSTime in seconds of the week"
 
 
@@ -161,9 +167,12 @@ def _date(export: WaypointExport, days: str, row: int) -> date:
         raise export.file.error(f"has dates in {column.unit or 'no unit'}", _TIME_REMEDY)
     try:
         parts = dict(zip(order, map(int, re.split("[-/.]", text)), strict=True))
-        return date(parts["y"], parts["m"], parts["d"])
-    except ValueError as error:
-        raise export.error_at(row, f"{days} {text!r} is not a date", _TIME_REMEDY) from error
+        day = date(parts["y"], parts["m"], parts["d"])
+    except (ValueError, OverflowError):
+        day = date.min
+    if day.year < _GPS_YEAR:
+        raise export.error_at(row, f"{days} {text!r} is not a date of GPS", _TIME_REMEDY)
+    return day
 
 
 def _clock_s(export: WaypointExport, time: str) -> FloatArray:
@@ -197,9 +206,9 @@ def _position_precision(export: WaypointExport) -> tuple[FloatArray | None, Floa
     cells = {name for row in _COV_PLACE for name in row}
     if cells <= export.columns.keys():
         _check_scale(export, "Position")
-        cov = np.stack([_block(export, row, "m^2") for row in _COV_PLACE], axis=1)
-        if np.linalg.eigvalsh(cov).min() >= 0.0:
-            return cov, np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+        written = np.stack([_block(export, row, "m^2") for row in _COV_PLACE], axis=1)
+        cov = true_covariances(written)
+        return cov, np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
     if not set(_SD_PLACE) <= export.columns.keys():
         return None, None
     return None, _deviations(export, _SD_PLACE, "m", "Position")
@@ -217,7 +226,7 @@ def _deviations(export: WaypointExport, names: Sequence[str], unit: str, kind: s
 def _check_scale(export: WaypointExport, kind: str) -> None:
     """Refuse standard deviations that the program has scaled to a higher confidence."""
     scale = export.scales.get(kind, "1")
-    number = re.match(r"[\d.]+", scale)
+    number = re.match(r"\d+(?:\.\d*)?", scale)
     if scale.lower().startswith("no scaling") or (number and float(number[0]) == 1.0):
         return
     raise export.file.error(

@@ -154,7 +154,7 @@ def test_seconds_of_the_week_alone_need_the_day(tmp_path: Path) -> None:
         ("  0.4095", "", "line 17: has not one cell for each column"),
         ("(weeks)", "       ", "gives Week in no unit"),
         ("0.0210  0.0500", "-0.021  0.0500", "line 16: a standard deviation is negative"),
-        ("    (sec)", "(min sec)", "gives GPSTime in min sec, not in sec"),
+        ("    (sec)", "(min sec)", "gives GPSTime in min sec; export it in sec"),
         ("  Week     GPSTime", "  Epoch    TimeOfDay", "no column of times"),
     ],
 )
@@ -180,6 +180,7 @@ def test_a_time_that_is_none_is_refused(tmp_path: Path) -> None:
     for time, words in (
         ("06/16/2026,nan:00:01", "UTCTime 'nan:00:01' is not hh:mm:ss"),
         ("16/06/2026,08:00:01", "UTCDate '16/06/2026' is not a date"),
+        ("06/16/26,08:00:01", "UTCDate '06/16/26' is not a date"),
     ):
         row = "06/16/2026,08:00:00,48,11,500\n"
         with pytest.raises(KgcpError, match=f"line 17: {words}"):
@@ -201,6 +202,8 @@ def test_a_table_that_goes_on_below_words_is_refused(tmp_path: Path) -> None:
         read(written(tmp_path, broken))
     with pytest.raises(KgcpError, match="lacks the lines with the names"):
         read(written(tmp_path, "\n".join(rows[2:])))
+    with pytest.raises(KgcpError, match="lacks the lines with the names"):
+        read(written(tmp_path, "\n".join(["", *rows[1:]])))
 
 
 def test_two_units_for_one_column_are_refused(tmp_path: Path) -> None:
