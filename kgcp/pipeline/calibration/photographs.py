@@ -25,6 +25,7 @@ from kgcp.measurement.field_photograph import (
     measure_more,
 )
 from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.quality.checks.frame_header import FrameHeader
 
 _LARGEST_PX = 100_000
 
@@ -56,17 +57,16 @@ def learn_from_photos(task: PhotoTask, count: int, photos: tuple[Photo, ...]) ->
 def _readable(photos: Iterable[Photo]) -> Iterator[GreyArray]:
     for photo in photos:
         with suppress(Rejection):
-            yield _read(photo.path)
+            yield _read(photo)[0]
 
 
 @single_threaded()
 def measure_photo(task: PhotoTask, photo: Photo) -> PhotoDiscs | PhotoMiss:
     """Find, identify and measure the discs; errors of the photograph become its result."""
     try:
-        grey = _read(photo.path)
+        grey, header = _read(photo)
     except Rejection as rejection:
         return PhotoMiss(photo.name, 0, 0, rejection.reason.value, rejection.detail)
-    header = read_frame_header(photo.path, photo.name)
     focal = f"{header.focal_mm:g} mm" if header.focal_mm else ""
     lens = " ".join(filter(None, (header.camera, focal)))
     return measure_field(grey, task, photo.name, lens)
@@ -76,7 +76,7 @@ def measure_photo(task: PhotoTask, photo: Photo) -> PhotoDiscs | PhotoMiss:
 def measure_photo_again(task: PhotoTask, look: SecondLook) -> PhotoDiscs | PhotoMiss:
     """Measure the discs of a photograph that the first pass did not find."""
     try:
-        grey = _read(look.photo.path)
+        grey, _ = _read(look.photo)
     except Rejection as rejection:
         raise KgcpError(
             f"{look.photo.path}: was readable before, but is not any more ({rejection.detail});"
@@ -85,13 +85,15 @@ def measure_photo_again(task: PhotoTask, look: SecondLook) -> PhotoDiscs | Photo
     return measure_more(grey, task, look.first, look.predicted, look.point.astype(np.intp))
 
 
-def _read(path: Path) -> GreyArray:
-    """Return the grey values of a photograph of any size."""
-    size = read_frame_header(path, path.name).size_px
+def _read(photo: Photo) -> tuple[GreyArray, FrameHeader]:
+    """Return grey values and header of a photograph of any size."""
+    header = read_frame_header(photo.path, photo.name)
+    size = header.size_px
     if size is None:
         raise Rejection(Reason.DECODE_FAILED, "does not begin like an image")
     width, height = size
     if not 2 <= min(size) <= max(size) <= _LARGEST_PX:
         raise Rejection(Reason.DECODE_FAILED, f"{width} x {height} px")
     focal = float(max(size))  # arbitrary: the reader compares only sizes
-    return read_grey(path, Camera(width, height, focal, focal, 0.5 * width, 0.5 * height))
+    camera = Camera(width, height, focal, focal, 0.5 * width, 0.5 * height)
+    return read_grey(photo.path, camera), header
