@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from functools import lru_cache
 from typing import Self
 
 import numpy as np
-from pyproj import CRS, Transformer
+from pyproj import CRS, Proj, Transformer
 from pyproj.aoi import AreaOfInterest
 from pyproj.crs import GeographicCRS
 from pyproj.exceptions import CRSError, ProjError
@@ -338,6 +339,27 @@ def is_geographic(crs: str) -> bool:
         If pyproj cannot read the CRS.
     """
     return bool(parse_crs(crs).is_geographic)
+
+
+def grid_scale(crs: str, longitude_deg: float, latitude_deg: float) -> float:
+    """Return the factor by which a projection stretches lengths at a place: the mean of both axes.
+
+    1 if the CRS is not projected, or PROJ does not know.
+
+    Raises
+    ------
+    KgcpError
+        If pyproj cannot read the CRS.
+    """
+    parsed = parse_crs(crs)
+    horizontal = parsed.sub_crs_list[0] if parsed.is_compound else parsed.to_2d()
+    if not horizontal.is_projected:
+        return 1.0
+    try:
+        factors = Proj(horizontal).get_factors(longitude_deg, latitude_deg)
+    except ProjError:
+        return 1.0
+    return math.sqrt(factors.areal_scale) if math.isfinite(factors.areal_scale) else 1.0
 
 
 def longitude_latitude(crs: str, xy: FloatArray) -> FloatArray:

@@ -57,7 +57,7 @@ from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild, ranked
 from kgcp.quality.checks.frame_header import FrameHeader, check_frames
 from kgcp.quality.checks.lever_arm import check_lever_arm
 from kgcp.quality.checks.measured import measured_doubts
-from kgcp.quality.checks.place import check_place
+from kgcp.quality.checks.place import check_grid_scale, check_place
 from kgcp.quality.checks.plate import check_plates
 from kgcp.quality.checks.reference import check_reference, check_visibility
 from kgcp.quality.checks.spikes import check_spikes
@@ -323,6 +323,7 @@ class FlightInputs:
             ground = longitude_latitude(crs, few)
             ground = ground[np.isfinite(ground).all(axis=1)]
             doubts += check_camera_position(self.headers, crs, ground, where)
+            doubts += check_grid_scale(crs, position)
         return doubts
 
     def _doubts_of_times(self) -> Iterator[Doubt]:

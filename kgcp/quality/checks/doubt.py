@@ -73,6 +73,7 @@ class Cause(StrEnum):
     AXES_SWAPPED = "axes_swapped", "x and y, or longitude and latitude, are exchanged"
     ANGLE_UNIT = "angle_unit", "angles or geographic coordinates are in radians or gon"
     CRS = "crs", "the coordinates are not in the CRS that is named"
+    GRID_SCALE = "grid_scale", "the CRS stretches or shrinks lengths too much for an adjustment"
     HEADING = (
         "heading",
         "headings do not follow the course: another zero direction or sense, offset, reversing",

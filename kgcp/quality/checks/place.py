@@ -7,12 +7,20 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.crs import AreaOfUse, area_of_use, is_geographic, longitude_latitude
-from kgcp.quality.checks.doubt import Cause, Doubt, grave
+from kgcp.georef.crs import (
+    AreaOfUse,
+    area_of_use,
+    grid_scale,
+    is_geographic,
+    longitude_latitude,
+)
+from kgcp.georef.crs_guess import utm_crs
+from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
 
 # Largest distance from the area. Zones are also used beside it: EPSG:25832 in all of Bavaria and
 # Denmark.
 _MAX_OUTSIDE_DEG = 3.5
+_MAX_STRETCH = 0.01  # of lengths on the map
 _NEAR_DEG = 1.0  # largest distance from the area of another reading that fits
 _MAX_DEG = np.array([180.0, 90.0])  # longitude, latitude
 _MAX_RAD = np.array([np.pi, 0.5 * np.pi])
@@ -48,6 +56,36 @@ def check_place(crs: str, position_map: FloatArray, where: str) -> Iterator[Doub
     else:
         code, words, remedy = guess
         yield grave(code, f"{sentence}: {words}", remedy, figures)
+
+
+def check_grid_scale(crs: str, position_map: FloatArray) -> Iterator[Doubt]:
+    """Yield the doubt about a CRS whose map is much larger or smaller than the ground.
+
+    Adjustments take coordinates for metres in all directions. Zones of a country's own grid are
+    true to 0.3 %, and heights are never stretched.
+
+    Parameters
+    ----------
+    position_map : (n, 2 or 3) array
+        Map positions within the area of the CRS.
+    """
+    place = longitude_latitude(crs, _median(position_map[:, :2])[None])[0]
+    if not np.isfinite(place).all():
+        return
+    longitude, latitude = place.tolist()
+    scale = grid_scale(crs, longitude, latitude)
+    if abs(scale - 1.0) <= _MAX_STRETCH:
+        return
+    change = "stretches" if scale > 1.0 else "shrinks"
+    yield mild(
+        Cause.GRID_SCALE,
+        f"{crs} {change} horizontal lengths by {100.0 * abs(scale - 1.0):.2g} % here, but not"
+        " heights: adjustments that take its coordinates for metres distort the scene",
+        f"give the region's own projection as crs in flight.toml, for example"
+        f" {utm_crs(longitude, latitude)}; a trajectory with longitude and latitude is transformed,"
+        " other coordinates must be exported anew",
+        {"scale": scale},
+    )
 
 
 def median_place(lonlat_deg: FloatArray) -> FloatArray:

@@ -7,7 +7,7 @@ from kgcp.georef.crs import area_of_use, longitude_latitude
 from kgcp.quality.checks.camera_position import check_altitude, check_camera_position
 from kgcp.quality.checks.doubt import Cause
 from kgcp.quality.checks.frame_header import FrameHeader
-from kgcp.quality.checks.place import check_place, place_text
+from kgcp.quality.checks.place import check_grid_scale, check_place, place_text
 
 # CRS, x and y of a place where it is used
 PLACES = [
@@ -32,6 +32,23 @@ PLACES = [
 @pytest.mark.parametrize(("crs", "x", "y"), PLACES)
 def test_coordinates_in_the_area_raise_no_doubt(crs: str, x: float, y: float) -> None:
     assert not [*check_place(crs, np.array([[x, y, 500.0], [x + 1e-4, y, 500.0]]), "the points")]
+
+
+@pytest.mark.parametrize(("crs", "x", "y"), PLACES)
+def test_maps_that_are_not_to_scale_are_doubted(crs: str, x: float, y: float) -> None:
+    doubts = [*check_grid_scale(crs, np.array([[x, y, 500.0], [x + 1e-4, y, 500.0]]))]
+    assert [doubt.code for doubt in doubts] == [Cause.GRID_SCALE] * (crs == "EPSG:3857")
+
+
+def test_the_scale_of_a_map_is_that_of_mercator_s_projection() -> None:
+    """1 / cos of the latitude on the sphere, and a UTM zone for the place."""
+    (doubt,) = check_grid_scale("EPSG:3857", np.array([[1285600.0, 6133000.0]]))
+    assert doubt.figures["scale"] == pytest.approx(1.0 / np.cos(np.radians(48.15)), rel=0.003)
+    assert "stretches horizontal lengths by 50 % here" in doubt.sentence
+    assert "EPSG:32632" in doubt.remedy
+    assert not doubt.is_grave
+    (shrunk,) = check_grid_scale("EPSG:3034", np.array([[4.1e6, 2.4e6]]))
+    assert "EPSG:3034 shrinks horizontal lengths by 3." in shrunk.sentence
 
 
 @pytest.mark.parametrize(("crs", "x", "y"), [PLACES[i] for i in (0, 2, 5, 6, 7, 8)])
