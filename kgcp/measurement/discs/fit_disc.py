@@ -426,7 +426,10 @@ class DiscFit:
             inverse = np.linalg.inv(self.normal)
         except np.linalg.LinAlgError:
             raise NoFit from None
-        own = np.sum((inverse @ self.scaled) * self.scaled, axis=0)
+        with np.errstate(over="ignore", invalid="ignore"):  # of equations that are nearly singular
+            own = np.sum((inverse @ self.scaled) * self.scaled, axis=0)
+        if not np.isfinite(own).all():
+            raise NoFit
         return np.asarray(self.misfit.weight * own)
 
     @property

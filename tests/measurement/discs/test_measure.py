@@ -318,6 +318,16 @@ def test_noise_about_a_wrong_model_of_a_burnt_disc_is_not_small(
     assert noise[-1] > 0.1
 
 
+def test_equations_that_are_nearly_singular_are_no_fit(dark: Rendered) -> None:
+    """Their leverage overflows; it must neither warn nor be used."""
+    outline = find_outlines(dark.photo)[0]
+    free = fit_disc.DiscUnknowns.of(Tone.LINEAR)
+    fit = adjust_disc.adjust_disc(adjust_disc.DiscTask(dark.photo, outline, []), free)
+    assert np.isfinite(fit.leverage).all()
+    with pytest.raises(fit_disc.NoFit):
+        _ = replace(fit, normal=1e-308 * fit.normal / np.abs(fit.normal).max()).leverage
+
+
 @pytest.mark.parametrize("response", list(Response))
 def test_a_disc_without_usable_pixels_is_refused(
     response: Response, monkeypatch: pytest.MonkeyPatch
