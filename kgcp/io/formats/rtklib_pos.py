@@ -58,7 +58,8 @@ def read_solution(file: ForeignFile) -> RtklibSolution:
     if header is None:
         raise file.error(
             "lacks the header line '% GPST …' that names its columns",
-            "write the solution with its header (out-outhead = on)",
+            "write the solution with its header (out-outhead = on), or put that of another solution"
+            " above it if columns, time system and datum are the same, as in a receiver's own log",
         )
     names = _NAME.findall(header[2])
     width = sum(3 if unit == _SEXAGESIMAL else 1 for _, unit in names)

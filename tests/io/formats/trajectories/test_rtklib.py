@@ -256,7 +256,9 @@ def test_wrong_files_are_a_one_line_error(
 def test_a_file_without_its_header_is_recognised_and_refused(tmp_path: Path) -> None:
     path = tmp_path / "vehicle.pos"
     path.write_text("\n".join(calendar_rows()) + "\n", encoding="utf-8")
-    with pytest.raises(KgcpError, match=r"lacks the header line .*out-outhead"):
+    with pytest.raises(
+        KgcpError, match=r"lacks the header line .*out-outhead.* put that of another"
+    ):
         read_trajectory(path, "EPSG:25832", COURSE)
 
 
