@@ -132,13 +132,13 @@ class Reason(StrEnum):
         "no_prediction",
         Status.NOT_FOUND,
         "nothing predicts well enough where a plain target is in this frame",
-        "give [reference] poses of the frames (see kgcp orient), marks or more static targets",
+        "give precise [reference] poses (see kgcp orient), marks (--places) or more static targets",
     )
     UNLIKE_PREDICTION = (
         "unlike_prediction",
         Status.NOT_FOUND,
         "the edge near the predicted place of a plain target has another place, size or shape",
-        "none needed if it is hidden; else correct its diameter, position or normal",
+        "none needed if it is hidden; else correct its diameter, position or normal, or the poses",
     )
     AMBIGUOUS_PLACE = (
         "ambiguous_place",

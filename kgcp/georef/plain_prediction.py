@@ -1,10 +1,11 @@
-"""Prediction of plain targets in frames with known exterior orientation or with marks."""
+"""Prediction of static targets in frames with known exterior orientation or with marks."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -14,9 +15,9 @@ from kgcp.geometry.camera import Camera
 from kgcp.georef.exterior_orientation import ExteriorOrientations, visible_pixel
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.target_positions import TargetPositions
-from kgcp.measurement.plain_prediction import PlainPrediction
+from kgcp.measurement.plain_prediction import SIGMAS, PlainPrediction
 from kgcp.measurement.plate_prior import NormalPrior
-from kgcp.targets.plain import PlainTarget
+from kgcp.targets.plain import AnyTarget, PlainTarget
 
 # Least standard deviations of a centre and of the logarithm of a distance, whatever is stated.
 _MIN_SD_PX, _MIN_SD_LOG = 1.0, 0.002
@@ -40,6 +41,34 @@ class MarkedPlace:
     x_px: float
     y_px: float
     sd_px: float  # standard deviation of either coordinate [px]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PredictedPlace:
+    """Where a static target must be in a frame."""
+
+    centre_px: FloatArray  # (2,): projected centre [px]
+    cov_px2: FloatArray  # (2, 2): its covariance [px²]
+    radius_px: float  # largest radius of its outer circle [px]
+
+    def contradiction_px(
+        self, place_px: FloatArray, sd_px: float = 0.0, sigmas: float = SIGMAS
+    ) -> float | None:
+        """Return how far off the target's place is, if this contradicts the prediction [px].
+
+        None: the standard deviations explain it.
+
+        Parameters
+        ----------
+        sd_px : float
+            Standard deviation of either coordinate of that place [px].
+        sigmas : float
+            How many standard deviations it may be off.
+        """
+        off_px = place_px - self.centre_px
+        cov_px2 = self.cov_px2 + sd_px**2 * np.eye(2)
+        is_far = float(off_px @ np.linalg.solve(cov_px2, off_px)) > sigmas**2
+        return float(np.linalg.norm(off_px)) if is_far else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,34 +128,76 @@ def _predicted(
     camera: Camera,
 ) -> PlainPrediction | None:
     """Predict one target; None if it is not in front of the camera."""
-    place = positions.static[target.name]
-    camera_from_enu = orientation.enu_from_camera.T
-    from_centre_m = place.position_m - orientation.centre_m
-    sight_m = camera_from_enu @ from_centre_m
-    centre_px = visible_pixel(camera, sight_m)
-    if not np.isfinite(centre_px).all():
+    sight = _Sight.of(target, orientation, positions, camera)
+    if sight is None:
         return None
-    cov_m2 = np.zeros((3, 3)) if place.cov_m2 is None else place.cov_m2
-    min_sd_px, min_sd_log = _UNSTATED_SD_PX, _UNSTATED_SD_LOG
-    if orientation.cov is not None:
-        min_sd_px, min_sd_log = _MIN_SD_PX, _MIN_SD_LOG
-        cov_m2 = cov_m2 + place_covariances(orientation.cov, from_centre_m)
-    cov_m2 = camera_from_enu @ cov_m2 @ camera_from_enu.T
-    distance_m = float(np.linalg.norm(sight_m))
-    ray, by_position = sight_m / distance_m, _pixel_by_position(camera, sight_m)
-    # with a rolling shutter, the camera moves until the target's row is exposed
-    delay_s = float(camera.delay_s(centre_px[None])[0])
-    turn_px = math.radians(camera.motion_sd_deg_s) * delay_s * camera.mean_focal_px
-    sd_log_distance = math.sqrt(max(0.0, float(ray @ cov_m2 @ ray))) / distance_m
+    distance_m = float(np.linalg.norm(sight.position_m))
+    ray = sight.position_m / distance_m
+    sd_log_distance = math.sqrt(max(0.0, float(ray @ sight.cov_m2 @ ray))) / distance_m
+    min_sd_log = _UNSTATED_SD_LOG if orientation.cov is None else _MIN_SD_LOG
+    place_m = positions.static[target.name].position_m
     return PlainPrediction(
-        centre_px=centre_px,
-        cov_px2=by_position @ cov_m2 @ by_position.T + (min_sd_px**2 + turn_px**2) * np.eye(2),
-        position_m=sight_m,
+        centre_px=sight.place.centre_px,
+        cov_px2=sight.place.cov_px2,
+        position_m=sight.position_m,
         sd_log_distance=math.hypot(sd_log_distance, min_sd_log),
-        normal=_stated_normal(target, place.position_m, orientation, positions.local_frame),
-        radius_px=target.radii_m[0] * camera.mean_focal_px / distance_m,
+        normal=_stated_normal(target, place_m, orientation, positions.local_frame),
+        radius_px=sight.place.radius_px,
         source=orientation.source,
     )
+
+
+def predict_places(
+    targets: Sequence[AnyTarget],
+    orientation: FrameOrientation,
+    positions: TargetPositions,
+    camera: Camera,
+) -> dict[str, PredictedPlace]:
+    """Predict the places of static targets; those behind the camera are left out."""
+    sights = {each.name: _Sight.of(each, orientation, positions, camera) for each in targets}
+    return {name: sight.place for name, sight in sights.items() if sight is not None}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sight:
+    """A static target as an oriented camera sees it."""
+
+    position_m: FloatArray  # (3,): its centre in the camera frame [m]
+    cov_m2: FloatArray  # (3, 3): its covariance in the camera frame [m²]
+    place: PredictedPlace
+
+    @classmethod
+    def of(
+        cls,
+        target: AnyTarget,
+        orientation: FrameOrientation,
+        positions: TargetPositions,
+        camera: Camera,
+    ) -> Self | None:
+        """Return it; None if the target is not in front of the camera."""
+        static = positions.static[target.name]
+        camera_from_enu = orientation.enu_from_camera.T
+        from_centre_m = static.position_m - orientation.centre_m
+        sight_m = camera_from_enu @ from_centre_m
+        centre_px = visible_pixel(camera, sight_m)
+        if not np.isfinite(centre_px).all():
+            return None
+        cov_m2 = np.zeros((3, 3)) if static.cov_m2 is None else static.cov_m2
+        min_sd_px = _UNSTATED_SD_PX
+        if orientation.cov is not None:
+            min_sd_px = _MIN_SD_PX
+            cov_m2 = cov_m2 + place_covariances(orientation.cov, from_centre_m)
+        cov_m2 = camera_from_enu @ cov_m2 @ camera_from_enu.T
+        by_position = _pixel_by_position(camera, sight_m)
+        # with a rolling shutter, the camera moves until the target's row is exposed
+        delay_s = float(camera.delay_s(centre_px[None])[0])
+        turn_px = math.radians(camera.motion_sd_deg_s) * delay_s * camera.mean_focal_px
+        place = PredictedPlace(
+            centre_px,
+            by_position @ cov_m2 @ by_position.T + (min_sd_px**2 + turn_px**2) * np.eye(2),
+            0.5 * target.outer_diameter_m * camera.mean_focal_px / float(np.linalg.norm(sight_m)),
+        )
+        return cls(sight_m, cov_m2, place)
 
 
 def _stated_normal(

@@ -135,7 +135,7 @@ def _check_prediction(camera: Camera, target: PlainTarget, prediction: PlainPred
     if prediction.is_from_behind():
         raise Rejection(Reason.OUT_OF_VIEW, f"{prediction}, seen from behind")
     if not prediction.is_sure:
-        raise Rejection(Reason.NO_PREDICTION, f"{prediction}: too uncertain to search there")
+        raise Rejection(Reason.NO_PREDICTION, f"too uncertain to search there; {prediction}")
     smallest_px = smallest_radius_px(target)
     if prediction.radius_px < smallest_px:
         raise Rejection(Reason.TOO_SMALL, f"{prediction}, below {smallest_px:g} px")

@@ -47,15 +47,18 @@ from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.frame_priors import priors_of_frames
 from kgcp.pipeline.frame_task import DetectionJob, FrameInput, examine_frame
 from kgcp.pipeline.guidance import (
-    plain_by_reference,
+    ContradictedMarks,
+    marks_against_reference,
     plain_by_results,
     predict_missing,
+    static_by_reference,
     with_predictions,
 )
 from kgcp.pipeline.overlay import draw_overlay
 from kgcp.pipeline.run_summary import DetectionSummary, Stopwatch, SummaryBuilder
 from kgcp.pipeline.workspace import DETECTIONS, require_outside_frames, results_folder
 from kgcp.quality.checks.plate import check_print
+from kgcp.quality.number_text import counted
 from kgcp.report.contact_sheet import ContactSheet
 from kgcp.settings import DetectSettings, require_flag, require_kind, require_range
 from kgcp.targets.plain import shape_of
@@ -303,12 +306,19 @@ def _frame_inputs(flight: Flight, data: FlightData, frames: Sequence[str]) -> li
     rows = zip(
         frames,
         priors_of_frames(flight, data, frames),
-        plain_by_reference(flight, data, frames),
+        static_by_reference(flight, data, frames),
         strict=True,
     )
     return [
-        FrameInput(frame, times.get(frame), priors, flight.may_use_exif_times, plain)
-        for frame, priors, plain in rows
+        FrameInput(
+            frame,
+            times.get(frame),
+            priors,
+            flight.may_use_exif_times,
+            by_reference.plain,
+            by_reference.coded,
+        )
+        for frame, priors, by_reference in rows
     ]
 
 
@@ -389,7 +399,26 @@ def _marks(
                 " exchanged; exchange their names, or look at their position_m",
                 option="places",
             )
+    wrong = marks_against_reference(flight, data, marks)
+    if wrong is not None:
+        raise KgcpError(f"{places}: {_contradiction(wrong)}", option="places")
     return marks
+
+
+def _contradiction(wrong: ContradictedMarks) -> str:
+    """Return in words how marks contradict reference poses, and what to do."""
+    poses = (
+        "give rough [reference] poses their standard deviations (sd_x, sd_y, sd_z, sd_angle_deg),"
+        " or do without them"
+    )
+    mark = "correct the marks, or the targets' position_m"
+    is_most = 2 * wrong.contradicted > wrong.compared
+    remedy = f"{poses}; else {mark}" if is_most else f"{mark}; else {poses}"
+    return (
+        f"{wrong.contradicted} of {counted(wrong.compared, 'mark')} are not where the reference"
+        f" poses have the targets, that of {wrong.target!r} in {wrong.frame} by"
+        f" {wrong.off_px:.0f} px; {remedy}"
+    )
 
 
 def _sheet(flight: Flight, folder: Path) -> ContactSheet:

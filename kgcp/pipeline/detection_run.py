@@ -469,6 +469,7 @@ class DetectionRun:
             frame_input.may_use_exif_time,
             frame_input.priors,
             frame_input.plain,
+            frame_input.coded,
             tone_base,
         )
         return f"{_first_name(frame_input.frame)}-{fingerprint(file, *known)[:16]}"

@@ -14,6 +14,7 @@ from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.geometry.camera import Camera, TimeReference
 from kgcp.geometry.circle_image import Circles3D, eccentricity
 from kgcp.geometry.conic import Ellipse
+from kgcp.georef.plain_prediction import PredictedPlace
 from kgcp.io.images.exif import Exif, read_exif
 from kgcp.io.images.frames import read_grey
 from kgcp.io.images.remote import StoredFolder, at_hand
@@ -42,6 +43,7 @@ from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
 from kgcp.targets.plain import AnyTarget, PlainTarget
 
+_LEAST_CONTRADICTIONS = 2  # coded targets that contradict a pose; one alone may have been moved
 _MAX_DROPPED = 24  # dropped rings per frame that are kept to be shown; textures may have hundreds
 
 
@@ -93,6 +95,8 @@ class FrameInput:
     may_use_exif_time: bool = True  # whether EXIF gives the time if the times file does not
     # predictions of plain targets, by their names
     plain: Mapping[str, PlainPrediction] = field(default_factory=dict)
+    # places of coded static targets by the same source, which check it
+    coded: Mapping[str, PredictedPlace] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,16 +123,7 @@ def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
             grey = read_grey(path, job.camera)
         examination = examine(grey, job.camera, job.targets, job.settings, job.priors(frame_input))
         measured = [each for each in examination.outcomes if isinstance(each, Measurement)]
-        plain = [
-            measure_plain(
-                grey,
-                job.camera,
-                target,
-                _predicted(frame_input, frame_input.plain, target),
-                measured,
-            )
-            for target in job.plain_targets
-        ]
+        plain = _first_plain(job, frame_input, grey, measured)
         outcomes = completed(job, (*examination.outcomes, *refuse_shared_edges(plain)))
         if job.kept_frames is not None and any(isinstance(outcome, Miss) for outcome in outcomes):
             job.kept_frames.keep(frame_input.frame, grey)
@@ -143,6 +138,47 @@ def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
     return FrameResult(
         frame_input.frame, time_s, exif.exposure, outcomes, exif.time_s, dropped, time_source
     )
+
+
+def _first_plain(
+    job: DetectionJob, frame_input: FrameInput, grey: GreyArray, measured: Sequence[Measurement]
+) -> list[Outcome]:
+    """Measure the plain targets where the reference pose predicts them, unless it is wrong.
+
+    It is if most coded static targets, and at least two, are not where it has them. Another target
+    may then be where it predicts a plain one. A later look may have a better prediction.
+    """
+    contradiction = _contradiction(frame_input.coded, measured)
+    if contradiction is not None:
+        return [
+            Miss(target.name, Reason.NO_PREDICTION, contradiction) for target in job.plain_targets
+        ]
+    return [
+        measure_plain(
+            grey,
+            job.camera,
+            target,
+            _predicted(frame_input, frame_input.plain, target),
+            measured,
+        )
+        for target in job.plain_targets
+    ]
+
+
+def _contradiction(
+    places: Mapping[str, PredictedPlace], measured: Sequence[Measurement]
+) -> str | None:
+    """Return in words how the reference pose contradicts coded targets; None: it does not."""
+    several = {each.target for each in measured if each.instance}
+    compared = [
+        places[each.target].contradiction_px(each.centre_px)
+        for each in measured
+        if each.target in places and each.target not in several
+    ]
+    off_px = [each for each in compared if each is not None]
+    if len(off_px) < _LEAST_CONTRADICTIONS or 2 * len(off_px) <= len(compared):
+        return None
+    return f"the reference pose has coded targets {max(off_px):.0f} px off their places"
 
 
 def _frame_time(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,8 +14,10 @@ from kgcp.geometry.camera import Camera
 from kgcp.georef.plain_neighbours import PlainTracks
 from kgcp.georef.plain_prediction import (
     FrameOrientation,
+    PredictedPlace,
     Predictions,
     predict_marked,
+    predict_places,
     predict_plain,
     reference_orientations,
 )
@@ -27,6 +29,7 @@ from kgcp.io.formats.marks import HandMark
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import FrameResult, Measurement, Miss, is_unreadable
 from kgcp.network.ground.frame_poses import orient_frames, print_scale_sd
+from kgcp.targets.layout import Target
 from kgcp.targets.plain import AnyTarget
 
 # Reasons for which rings that do not belong to the target may be dropped.
@@ -34,6 +37,10 @@ _NO_TARGET = {
     *(Reason.NO_CANDIDATE, Reason.CODE_MISMATCH, Reason.OTHER_CODE, Reason.TOO_SMALL),
     *(Reason.TOO_BLURRED, Reason.CLIPPED, Reason.HIDDEN, Reason.CUT),
 }
+
+# How many standard deviations a mark may be off the place by the reference pose. One in a thousand
+# marks is off by four, and a single wrong one stops a run.
+_MARK_SIGMAS = 6.0
 
 
 class FrameTracks:
@@ -97,10 +104,19 @@ def predict_missing(
     return predictions, problem
 
 
-def plain_by_reference(
+@dataclass(frozen=True, slots=True, eq=False)
+class ByReference:
+    """What the reference pose of a frame predicts of static targets, by their names."""
+
+    plain: Predictions = field(default_factory=dict)  # of plain targets
+    # of coded targets whose positions have standard deviations
+    coded: Mapping[str, PredictedPlace] = field(default_factory=dict)
+
+
+def static_by_reference(
     flight: Flight, data: FlightData, frames: Sequence[str]
-) -> list[Predictions]:
-    """Return for each frame the predictions of its plain targets by the reference poses.
+) -> list[ByReference]:
+    """Return for each frame what its reference pose predicts, if there are plain targets.
 
     Raises
     ------
@@ -108,15 +124,63 @@ def plain_by_reference(
         If there are plain targets, and the reference poses cannot be read or there is no crs.
     """
     if not flight.plain_targets or not data.has_reference:
-        return [{}] * len(frames)
-    positions = data.static_positions
+        return [ByReference()] * len(frames)
+    positions, camera = data.static_positions, flight.camera
     orientations = reference_orientations(data.reference_poses, positions.local_frame)
+    coded = [
+        target
+        for target in flight.static_targets
+        if isinstance(target, Target) and positions.static[target.name].cov_m2 is not None
+    ]
     return [
-        predict_plain(flight.plain_targets, orientations[frame], positions, flight.camera)
+        ByReference(
+            predict_plain(flight.plain_targets, orientations[frame], positions, camera),
+            predict_places(coded, orientations[frame], positions, camera),
+        )
         if frame in orientations
-        else {}
+        else ByReference()
         for frame in frames
     ]
+
+
+@dataclass(frozen=True, slots=True)
+class ContradictedMarks:
+    """Marks by hand that are not where reference poses predict the targets."""
+
+    frame: str  # of the farthest one
+    target: str
+    off_px: float  # how far it is off
+    contradicted: int
+    compared: int
+
+
+def marks_against_reference(
+    flight: Flight, data: FlightData, marks: Mapping[str, Sequence[HandMark]]
+) -> ContradictedMarks | None:
+    """Compare marks with the reference poses of their frames; None: none is contradicted.
+
+    A mark on the predicted target is not contradicted, even if it is not at its centre.
+    """
+    if not data.has_reference:
+        return None
+    positions, static = data.static_positions, flight.static_targets
+    orientations = reference_orientations(data.reference_poses, positions.local_frame)
+    compared, contradicted = 0, []
+    for frame in marks.keys() & orientations.keys():
+        places = predict_places(static, orientations[frame], positions, flight.camera)
+        for mark in marks[frame]:
+            predicted = places.get(mark.target)
+            if predicted is None:
+                continue
+            compared += 1
+            place_px = np.array([mark.place.x_px, mark.place.y_px])
+            off_px = predicted.contradiction_px(place_px, mark.place.sd_px, _MARK_SIGMAS)
+            if off_px is not None and off_px > predicted.radius_px:
+                contradicted.append((off_px, frame, mark.target))
+    if not contradicted:
+        return None
+    off_px, frame, target = max(contradicted)
+    return ContradictedMarks(frame, target, off_px, len(contradicted), compared)
 
 
 def plain_by_results(

@@ -17,7 +17,9 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import rotation_about
 from kgcp.georef.local_frame import LocalFrame
+from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import read_flight
+from kgcp.io.formats.marks import read_marks
 from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.parquet import read_table
 from kgcp.measurement.plain_pose import pose_towards
@@ -26,6 +28,7 @@ from kgcp.pipeline.detect import RunOptions, detect_flight
 from kgcp.pipeline.export import make_gcps
 from kgcp.pipeline.ground.orient import orient_flight, write_poses
 from kgcp.pipeline.ground.place import PlaceOptions, place_flight
+from kgcp.pipeline.guidance import marks_against_reference
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.plate import PlainPlate, image_plate
 from kgcp.targets.layout import Target
@@ -179,21 +182,46 @@ def test_plain_targets_are_not_searched_without_poses(folder: Path, tmp_path: Pa
     bare = text.replace('[reference]\nposes = "reference.csv"\n', "")
     (tmp_path / "flight.toml").write_text(bare, encoding="utf-8")
     share(folder / "vehicle.csv", tmp_path / "vehicle.csv")
-    assert "12 no_prediction: give [reference] poses" in run("detect", tmp_path, "--jobs", "0")
+    assert "12 no_prediction: give precise [reference] poses" in run("detect", tmp_path, "--jobs", "0")
     table = detections(tmp_path)
     assert set(table["target"][table["status"] == "measured"]) == {"car"}
 
 
 def test_coded_targets_in_the_frame_predict_plain_targets(tmp_path: Path) -> None:
+    """Instead of a reference pose that puts the coded ones elsewhere, too."""
     made = PlainFlight(frames=1, coded=CODED)
     made.write(tmp_path)
-    (tmp_path / "reference.csv").unlink()
+    turn_reference(tmp_path, 7.0)
     run("detect", tmp_path, "--jobs", "0")
     table = detections(tmp_path)
     assert set(table["status"]) == {"measured"}
     rows = table.set_index("target")
     assert rows["guided"].sum() == len(TARGETS)
     assert_at(rows, made.centres_m(0))
+
+
+def turn_reference(folder: Path, degrees: float) -> None:
+    """Turn all reference poses about the vertical."""
+    poses = pd.read_csv(folder / "reference.csv")
+    poses["kappa_deg"] += degrees
+    poses.to_csv(folder / "reference.csv", index=False)
+
+
+def test_marks_that_contradict_reference_poses_are_refused(tmp_path: Path) -> None:
+    """They would be ignored, because a reference pose is preferred."""
+    made = PlainFlight(frames=1)
+    made.write(tmp_path)
+    lines = ["frame,target,x_px,y_px"]
+    for target, (x, y) in zip(made.targets, CAMERA.project(made.centres_m(0)), strict=True):
+        lines.append(f"f_0.png,{target.name},{x + 6.0:.0f},{y - 6.0:.0f}")  # still on the target
+    path = tmp_path / "places.csv"
+    path.write_text("\n".join(lines), encoding="utf-8")
+    flight = read_flight(tmp_path)
+    marks = read_marks(path, ["f_0.png"], [each.name for each in TARGETS], CAMERA)
+    assert marks_against_reference(flight, FlightData(flight, ["f_0.png"]), marks) is None
+    turn_reference(tmp_path, 40.0)
+    with pytest.raises(KgcpError, match=r"3 of 3 marks are not where .* give rough \[reference\]"):
+        detect_flight(flight, options=RunOptions(jobs=0, places=path))
 
 
 @pytest.fixture(scope="module")
