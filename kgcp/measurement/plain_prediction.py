@@ -107,6 +107,12 @@ class PlainPrediction:
         reach = self.radius_px + self.reach_px
         return bool(max(-x, x - camera.width + 1.0, -y, y - camera.height + 1.0) > reach)
 
+    def is_inside(self, camera: Camera) -> bool:
+        """Tell whether the whole target is predicted inside the frame."""
+        x, y = self.centre_px
+        margin = min(x, camera.width - 1.0 - x, y, camera.height - 1.0 - y)
+        return bool(margin >= self.radius_px)
+
 
 def smallest_radius_px(target: PlainTarget) -> float:
     """Return the least radius at which a plain target is looked for [px]."""

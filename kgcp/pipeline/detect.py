@@ -51,6 +51,7 @@ from kgcp.pipeline.guidance import (
     marks_against_reference,
     plain_by_results,
     predict_missing,
+    searches_by_reference,
     static_by_reference,
     with_predictions,
 )
@@ -58,6 +59,7 @@ from kgcp.pipeline.overlay import draw_overlay
 from kgcp.pipeline.run_summary import DetectionSummary, Stopwatch, SummaryBuilder
 from kgcp.pipeline.workspace import DETECTIONS, require_outside_frames, results_folder
 from kgcp.quality.checks.plate import check_print
+from kgcp.quality.checks.static_targets import check_searches
 from kgcp.quality.number_text import counted
 from kgcp.report.contact_sheet import ContactSheet
 from kgcp.settings import DetectSettings, require_flag, require_kind, require_range
@@ -236,7 +238,10 @@ def detect_flight(
             guide_problem=guide_problem,
             learnt=run.learnt,
             stages_s=_stages_s(stopwatch, journal, pool),
-            doubts=[*check_print(builder.prints, flight.all_targets, flight.camera)],
+            doubts=[
+                *check_print(builder.prints, flight.all_targets, flight.camera),
+                *check_searches(builder.searches),
+            ],
         )
         record = {**summary.numbers(), "jobs": pool.jobs, "settings": asdict(settings)}
         # after all workers have ended, because the record has their peak memory
@@ -484,7 +489,7 @@ def _write_detections(
         task.options.frame_patterns,
         task.options.places,
     )
-    rows = _rows(run, predictions, task.flight, builder)
+    rows = _rows(run, predictions, task, builder)
     write_table(table, DETECTION_COLUMNS, rows, about)
     return builder
 
@@ -492,11 +497,13 @@ def _write_detections(
 def _rows(
     run: DetectionRun,
     predictions: Mapping[int, Mapping[str, Prediction]],
-    flight: Flight,
+    task: _DetectionTask,
     builder: SummaryBuilder,
 ) -> Iterator[Row]:
+    flight = task.flight
     shapes = {target.name: shape_of(target) for target in flight.all_targets}
     for row, result in enumerate(run.results()):
         completed = with_predictions(result, predictions.get(row, {}), flight.camera)
-        builder.add(completed)
+        plain = task.inputs[row].plain
+        builder.add(completed, searches_by_reference(completed, plain, flight.camera))
         yield from detection_rows(completed, shapes)

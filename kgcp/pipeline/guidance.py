@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -29,6 +29,7 @@ from kgcp.io.formats.marks import HandMark
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import FrameResult, Measurement, Miss, is_unreadable
 from kgcp.network.ground.frame_poses import orient_frames, print_scale_sd
+from kgcp.quality.checks.static_targets import PlainSearch
 from kgcp.targets.layout import Target
 from kgcp.targets.plain import AnyTarget
 
@@ -141,6 +142,27 @@ def static_by_reference(
         else ByReference()
         for frame in frames
     ]
+
+
+def searches_by_reference(
+    result: FrameResult, predicted: Predictions, camera: Camera
+) -> Iterator[PlainSearch]:
+    """Yield how plain targets were found where a frame's reference pose has them.
+
+    Left out are those that are not wholly inside the frame, those with too uncertain a prediction,
+    and those that another source predicted, since the pose contradicts coded targets.
+    """
+    for outcome in result.outcomes:
+        prediction = predicted.get(outcome.target)
+        if prediction is None or not prediction.is_sure or not prediction.is_inside(camera):
+            continue
+        if isinstance(outcome, Miss):
+            if not is_unreadable(outcome) and outcome.reason is not Reason.NO_PREDICTION:
+                yield PlainSearch(result.frame, outcome.target, None)
+        elif not outcome.is_guided:
+            off_px = outcome.centre_px - prediction.centre_px
+            chi2 = float(off_px @ np.linalg.solve(prediction.cov_px2, off_px))
+            yield PlainSearch(result.frame, outcome.target, chi2)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import re
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from itertools import islice
 from pathlib import Path
 
 from kgcp.errors import Reason, Status
@@ -15,6 +16,7 @@ from kgcp.io.formats.frame_names import likely_difference
 from kgcp.measurement.records import FrameResult, Measurement, Miss, TimeSource
 from kgcp.quality.checks.doubt import Doubt
 from kgcp.quality.checks.plate import SeenPrint
+from kgcp.quality.checks.static_targets import PlainSearch
 from kgcp.quality.learnt_imaging import LearntImaging
 
 _MAX_DETAILS = 1000  # different details kept per reason; numbers in them differ between frames
@@ -23,6 +25,7 @@ _PREDICTION = re.compile(r"(^|; )expected by .*")
 _NUMBERS_OF_TEST = re.compile(r" \([^()]*\)$")
 _NUMBER = re.compile(r"-?\d+(\.\d+)?")
 _MAX_PRINTS = 10_000  # measurements that show how the targets are printed
+_MAX_SEARCHES = 10_000  # searches that show how good the reference poses are
 _MAX_COMPARED = 1000  # differing names among which two similar ones are searched for
 
 
@@ -76,7 +79,7 @@ class DetectionSummary:
     stages_s : dict of float
         Time that each stage of the work took [s].
     doubts : tuple of Doubt
-        About the prints, from up to 10 000 measurements together.
+        About the prints and the reference poses, each from up to 10 000 rows together.
     """
 
     table: Path
@@ -162,9 +165,11 @@ class SummaryBuilder:
         self._details: dict[Reason, Counter[str]] = defaultdict(Counter)
         self._from_exif: Counter[bool] = Counter()  # by whether the time is a whole second
         self.prints: list[SeenPrint] = []  # of the first measurements
+        self.searches: list[PlainSearch] = []  # the first ones
 
-    def add(self, result: FrameResult) -> None:
-        """Count a frame."""
+    def add(self, result: FrameResult, searches: Iterable[PlainSearch] = ()) -> None:
+        """Count a frame, and keep its searches for plain targets by its reference pose."""
+        self.searches += islice(searches, _MAX_SEARCHES - len(self.searches))
         self._frames += 1
         self._without_time += result.time_s is None
         if result.frame in self._times:

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from kgcp.cli import main
-from kgcp.errors import KgcpError
+from kgcp.errors import KgcpError, Reason
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import rotation_about
 from kgcp.georef.local_frame import LocalFrame
@@ -23,12 +23,18 @@ from kgcp.io.formats.marks import read_marks
 from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.parquet import read_table
 from kgcp.measurement.plain_pose import pose_towards
+from kgcp.measurement.records import ExposureSettings, FrameResult, Miss
 from kgcp.pipeline.bias_report import bias_study
 from kgcp.pipeline.detect import RunOptions, detect_flight
 from kgcp.pipeline.export import make_gcps
 from kgcp.pipeline.ground.orient import orient_flight, write_poses
 from kgcp.pipeline.ground.place import PlaceOptions, place_flight
-from kgcp.pipeline.guidance import marks_against_reference
+from kgcp.pipeline.guidance import (
+    marks_against_reference,
+    searches_by_reference,
+    static_by_reference,
+)
+from kgcp.quality.checks.static_targets import PlainSearch
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.plate import PlainPlate, image_plate
 from kgcp.targets.layout import Target
@@ -182,7 +188,8 @@ def test_plain_targets_are_not_searched_without_poses(folder: Path, tmp_path: Pa
     bare = text.replace('[reference]\nposes = "reference.csv"\n', "")
     (tmp_path / "flight.toml").write_text(bare, encoding="utf-8")
     share(folder / "vehicle.csv", tmp_path / "vehicle.csv")
-    assert "12 no_prediction: give precise [reference] poses" in run("detect", tmp_path, "--jobs", "0")
+    words = run("detect", tmp_path, "--jobs", "0")
+    assert "12 no_prediction: give precise [reference] poses" in words
     table = detections(tmp_path)
     assert set(table["target"][table["status"] == "measured"]) == {"car"}
 
@@ -205,6 +212,16 @@ def turn_reference(folder: Path, degrees: float) -> None:
     poses = pd.read_csv(folder / "reference.csv")
     poses["kappa_deg"] += degrees
     poses.to_csv(folder / "reference.csv", index=False)
+
+
+def test_searches_by_reference_poses_are_told_from_others(tmp_path: Path) -> None:
+    PlainFlight(frames=1).write(tmp_path)
+    flight = read_flight(tmp_path)
+    (known,) = static_by_reference(flight, FlightData(flight, ["f_0.png"]), ["f_0.png"])
+    misses = Miss("white", Reason.NO_CANDIDATE), Miss("black", Reason.NO_PREDICTION)
+    result = FrameResult("f_0.png", None, ExposureSettings(), misses)
+    searches = searches_by_reference(result, known.plain, CAMERA)
+    assert [*searches] == [PlainSearch("f_0.png", "white", None)]
 
 
 def test_marks_that_contradict_reference_poses_are_refused(tmp_path: Path) -> None:

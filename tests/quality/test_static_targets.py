@@ -16,7 +16,13 @@ from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition, TargetPositions, Vehicle
 from kgcp.georef.trajectory import Motion
 from kgcp.quality.checks.doubt import Cause, Doubt
-from kgcp.quality.checks.static_targets import check_places, check_static_targets, check_vehicle
+from kgcp.quality.checks.static_targets import (
+    PlainSearch,
+    check_places,
+    check_searches,
+    check_static_targets,
+    check_vehicle,
+)
 from kgcp.settings import VehicleSettings
 from tests.ground_flight import CAMERA, GroundFlight
 
@@ -393,3 +399,33 @@ def test_a_vehicle_that_is_not_where_targets_on_the_ground_see_it_is_grave(
         assert (doubt.code, doubt.is_grave) == (Cause.STATIC_TARGETS, True)
         assert "D on the vehicle and" in doubt.sentence
     assert [*check_vehicle(timed[:3], places, CAMERA)] == []  # a frame without the vehicle
+
+
+def searches(share: float, sigmas: float, seed: int = 4) -> list[PlainSearch]:
+    """Six targets in ten frames, of which a share is found, by poses that are so far off."""
+    rng = np.random.default_rng(seed)
+    made = []
+    for frame in range(10):
+        chi2 = sigmas**2 * float(rng.chisquare(2))  # the same of all targets
+        for name in "ABCDEF":
+            is_found = rng.uniform() < share
+            made.append(PlainSearch(f"f_{frame}.png", name, chi2 if is_found else None))
+    return made
+
+
+def test_poses_that_have_plain_targets_at_wrong_places_are_doubted() -> None:
+    (doubt,) = check_searches(searches(0.3, 2.0))
+    assert doubt.is_grave
+    assert doubt.code is Cause.REFERENCE
+    assert "of 60 places where the reference poses have them" in doubt.sentence
+    assert not list(check_searches(searches(0.95, 1.0)))
+    hidden = [*check_searches(searches(0.4, 1.0))]  # most of them, for another reason
+    assert not any(doubt.is_grave for doubt in hidden)
+
+
+def test_a_plain_target_that_is_hardly_ever_found_is_named() -> None:
+    made = [each._replace(chi2=None) if each.target == "C" else each for each in searches(1.0, 1.0)]
+    (doubt,) = check_searches(made)
+    assert doubt.sentence.startswith("C: found at 0 of 10 places")
+    assert not doubt.is_grave
+    assert "polarity" in doubt.remedy

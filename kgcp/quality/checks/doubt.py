@@ -104,10 +104,13 @@ class Cause(StrEnum):
         "several frames have the same time: they are copies, or times are in whole seconds",
     )
     FRAME_ORDER = "frame_order", "times or reference poses belong to the next or previous frame"
-    REFERENCE = "reference", "reference poses are of another place, rotated, or outdated"
+    REFERENCE = (
+        "reference",
+        "reference poses are of another place, rotated, outdated, or worse than stated",
+    )
     STATIC_TARGETS = (
         "static_targets",
-        "a static target is not at its position_m, as reference poses or the other targets show",
+        "a static target is not at its position_m, as poses or others show, or is not found there",
     )
     CAMERA_POSITION = (
         "camera_position",

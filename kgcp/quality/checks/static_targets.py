@@ -8,8 +8,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
+from scipy.special import chdtri
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses
@@ -32,6 +34,9 @@ _MIN_PAIRS = 3  # of targets, that distinguish a common factor from a wrong posi
 _MAX_NAMED = 3  # measurements in a message
 # Standard deviations of an image, by errors of the calibration, and with poses that state none.
 _CALIBRATION_SD_PX, _UNSTATED_POSE_SD_PX = 2.0, 5.0
+# Probability with which errors as stated are as large as those of reference poses that are doubted
+_UNLIKELY_OFF = 0.01
+_MIN_SEARCHES, _RARELY = 5, 0.25  # of a target, and the share of them in which it is rarely found
 _MIN_OFF_M = 0.05  # of a target from its position, by reference poses
 _MIN_VEHICLE_OFF_M = 0.1  # of a distance between the targets on vehicle and ground
 _ALIKE_SHARE = 0.2  # of their offset, by which targets differ that all lie alike
@@ -46,6 +51,63 @@ class _Pair:
     measured_m: float
     stated_m: float
     sd_m: float
+
+
+class PlainSearch(NamedTuple):
+    """The search for a plain target where the reference pose of a frame predicts it."""
+
+    frame: str
+    target: str
+    # squared distance from the predicted place over its covariance (2 coordinates); None: not found
+    chi2: float | None
+
+
+def check_searches(searches: Sequence[PlainSearch]) -> Iterator[Doubt]:
+    """Yield doubts about reference poses and plain targets that are not where these have them.
+
+    If poses are worse than stated, most targets are not found, and what is found may be another
+    one. If most were hidden, the others would be as near to their predicted places as stated.
+    """
+    by_frame = defaultdict(list)
+    for search in searches:
+        if search.chi2 is not None:
+            by_frame[search.frame].append(search.chi2)
+    found = sum(map(len, by_frame.values()))
+    # targets in a frame are off alike
+    chi2 = sum(float(np.mean(each)) for each in by_frame.values())
+    if found and 2 * found < len(searches) and chi2 > chdtri(2 * len(by_frame), _UNLIKELY_OFF):
+        ratio = math.sqrt(chi2 / (2 * len(by_frame)))
+        yield grave(
+            Cause.REFERENCE,
+            f"plain targets were found at {found} of {len(searches)} places where the reference"
+            f" poses have them, and {rounded(ratio)} times as far off as their standard deviations"
+            " say; what was found may be another target",
+            "give standard deviations that include all errors of the poses (sd_x, sd_y, sd_z,"
+            " sd_angle_deg), or marks instead of the poses (--places)",
+            {"searched": len(searches), "found": found, "ratio": ratio},
+        )
+    else:
+        yield from _rarely_found(searches)
+
+
+def _rarely_found(searches: Sequence[PlainSearch]) -> Iterator[Doubt]:
+    searched = Counter(search.target for search in searches)
+    found = Counter(search.target for search in searches if search.chi2 is not None)
+    rare = [
+        name
+        for name, count in searched.items()
+        if count >= _MIN_SEARCHES and found[name] < _RARELY * count
+    ]
+    if rare:
+        places, there = (sum(counts[name] for name in rare) for counts in (searched, found))
+        yield mild(
+            Cause.STATIC_TARGETS,
+            f"{listed(rare, _MAX_NAMED)}: found at {there} of {places} places where the reference"
+            f" poses have {'it' if len(rare) == 1 else 'them'}",
+            "unless hidden there, check polarity, diameters and position_m, or whether names are"
+            " exchanged; if it is so with most targets, the standard deviations of the poses",
+            {"searched": places, "found": there},
+        )
 
 
 def check_static_targets(
