@@ -17,6 +17,10 @@ _MAX_RATIO = 3.0  # of a diameter's residual to its standard deviation
 _MAX_CHI2 = 14.2  # of three coordinates, as likely as 3 standard deviations of one
 _ROUGH_M = 10.0  # error of a position of unknown accuracy that is not doubted
 _ALIKE_SHARE = 0.2  # largest difference between errors that count as one, as a share of it
+_ROUGH_PX = 5.0  # noise of places from which on poses are rough
+_ROUGH_POSES = (
+    ", and rough poses without their standard deviations have targets too far away: state these"
+)
 _MIN_NOISE_PX = 0.005  # of additional noise that is reported
 
 
@@ -168,7 +172,7 @@ def noise_sentence(placement: Placement) -> str:
     return (
         "the images deviate by more than the stated standard deviations:"
         f" {' and '.join(parts)}; the standard deviations include this, but no error that all"
-        " frames share"
+        f" frames share{_ROUGH_POSES * (noise.centre_px > _ROUGH_PX)}"
     )
 
 

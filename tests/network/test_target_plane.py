@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -100,6 +101,23 @@ def test_errors_of_poses_count_by_their_covariance() -> None:
         assert fit.is_used.sum() >= 7
         z.append(errors_of(fit.circle, truth) / np.sqrt(np.diag(fit.cov)))
     assert 0.75 < float(np.sqrt(np.mean(np.square(z)))) < 1.3
+
+
+def test_errors_of_poses_do_not_make_a_circle_larger() -> None:
+    """Rays from wrong places meet too far away, unless the equations have the likely places."""
+    rng, truth = np.random.default_rng(5), circle_of(10.0)
+    exterior = np.diag([0.5**2] * 3 + [1e-3**2] * 3)
+    views = views_of(truth, rng, tilt_deg=(5.0, 15.0), frames=40)
+    errors = rng.standard_normal((len(views), 6)) * np.sqrt(np.diag(exterior))
+    turns = np.array([rotation_about(error) for error in errors[:, 3:].copy()])
+    wrong = replace(
+        views,
+        camera_m=views.camera_m + errors[:, :3],
+        world_from_camera=turns @ views.world_from_camera,
+        exterior_cov=np.repeat(exterior[None], len(views), axis=0),
+    )
+    fit = place_circle(CAMERA, wrong).fit
+    assert np.abs(errors_of(fit.circle, truth) / np.sqrt(np.diag(fit.cov))).max() < 3.0
 
 
 def test_a_frame_that_shows_something_else_is_left_out() -> None:

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import optimize
+from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.attitude import cross_matrix
@@ -45,6 +46,7 @@ _MAX_STEPS = 60
 _ROUND_STEPS = 3  # steps per round of reweighting: the next weights move the minimum anyway
 _CONVERGED = 1e-5  # decrease of χ² at which the iteration ends
 _MAX_ROBUST_ROUNDS = 12
+_SETTLED_COST = 1e-3  # change of χ² between two rounds at which the poses count as settled
 _CAUCHY_CHI2 = 12.0  # χ² of a frame that has weight 1/2
 _MEDIAN_CHI2 = 4.351  # of five numbers
 _SAME_NORMAL_DEG = 0.5
@@ -326,29 +328,67 @@ def fit_to_agreeing(
     camera: Camera, views: CircleViews, circle: SpaceCircle, noise: ExtraNoise
 ) -> CircleFit | None:
     """Return the fit to the frames that agree; the others are rejected."""
-    used = np.zeros(len(views), dtype=np.bool_)
-    covs = total_covariances(camera, views, circle, noise)
-    chi2 = _chi2(camera, views, circle, covs)
+    used, at = np.zeros(len(views), dtype=np.bool_), views
+    covs = total_covariances(camera, at, circle, noise)
+    chi2 = _chi2(camera, at, circle, covs)
+    cost = math.inf
     for _ in range(_MAX_ROBUST_ROUNDS):
         scale = max(1.0, float(np.median(chi2)) / _MEDIAN_CHI2)
         kept = chi2 <= REJECTED_CHI2 * scale
-        if np.array_equal(kept, used) or np.count_nonzero(kept) < LEAST_FRAMES:
+        is_settled = at is views or abs(cost - _robust_cost(chi2)) <= _SETTLED_COST
+        if (np.array_equal(kept, used) and is_settled) or np.count_nonzero(kept) < LEAST_FRAMES:
             break
-        used = kept
-        moved = _minimised(camera, views, circle, covs, used.astype(np.float64))
+        used, cost = kept, _robust_cost(chi2)
+        moved = _minimised(camera, at, circle, covs, used.astype(np.float64))
         if moved is None:
             return None
         circle = moved
-        covs = total_covariances(camera, views, circle, noise)
-        chi2 = _chi2(camera, views, circle, covs)
+        at = _at_likely_poses(camera, views, at, circle, noise)
+        covs = total_covariances(camera, at, circle, noise)
+        chi2 = _chi2(camera, at, circle, covs)
     if not used.any():
         return None
-    normal = _normal_equations(camera, views.chosen(used), circle, covs[used])[0]
+    normal = _normal_equations(camera, at.chosen(used), circle, covs[used])[0]
     if not np.linalg.cond(_unit_diagonal(normal)) < 1e13:
         return None
     residuals = views.moments - circle_images(camera, circle.in_cameras(views)).moments
     cov = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     return CircleFit(circle, cov, residuals, chi2, used, _robust_cost(chi2))
+
+
+def _at_likely_poses(
+    camera: Camera, views: CircleViews, at: CircleViews, circle: SpaceCircle, noise: ExtraNoise
+) -> CircleViews:
+    """Return the views with the poses and, for these, the moments that a circle makes likely.
+
+    The equations of a circle are linear at `at`. Evaluated at the stated poses, they would have the
+    errors of these in their coefficients, and the circle would seem to be farther away and larger.
+    The moments are changed by the effect of the change of the poses, so that the residuals are
+    those with the stated poses, to first order (the Gauss-Helmert model).
+
+    Parameters
+    ----------
+    views, at : CircleViews
+        With the stated poses, and with those of the round before.
+    """
+    if views.exterior_cov is None:
+        return views
+    by_exterior = _moments_by_exterior(camera, at, circle)
+    residuals = at.moments - circle_images(camera, circle.in_cameras(at)).moments
+    covs = total_covariances(camera, at, circle, noise)
+    back = np.einsum("nmp,nm->np", by_exterior, np.linalg.solve(covs, residuals[..., None])[..., 0])
+    change = np.einsum("npq,nq->np", views.exterior_cov, back)
+    if not np.isfinite(change).all():
+        return at
+    moved = replace(
+        views,
+        camera_m=views.camera_m + change[:, :3],
+        world_from_camera=np.asarray(
+            Rotation.from_rotvec(change[:, 3:]).as_matrix() @ views.world_from_camera
+        ),
+    )
+    effect = np.einsum("nmp,np->nm", _moments_by_exterior(camera, moved, circle), change)
+    return replace(moved, moments=views.moments + effect)
 
 
 def _minimised(
