@@ -30,6 +30,9 @@ _MOST_BLUR = 0.5
 _ROUGH_PX = 0.075  # largest displacement of the centre that an uneven edge may cause
 _PLACE_PX = 0.1  # standard deviation of a predicted place, at least
 _UNLIKELY = 1e-4  # probability with which a true target's shape is refused
+# χ² of size and shape per degree of freedom, up to which a target counts as undisturbed. Tolerances
+# are wide: it is mostly below 0.05 on even ground, and below this limit on grass.
+_UNDISTURBED = 1.0 / 3.0
 # Two targets were measured from the same edge if their centres are nearer than this (in radii) and
 # the ratio of their radii is smaller than this.
 _SAME_PLACE, _SAME_SIZE = 0.35, 1.15
@@ -64,8 +67,8 @@ def check_edge(disc: Disc) -> None:
         raise Rejection(Reason.TOO_BLURRED, f"an edge spread by {disc.blur_px:.1f} px, at {size}")
 
 
-def _check_size(target: PlainTarget, prediction: PlainPrediction, pose: Pose) -> None:
-    """Refuse a distance that is not the predicted one."""
+def _size_chi2(target: PlainTarget, prediction: PlainPrediction, pose: Pose) -> float:
+    """Return the χ² of a distance that is the predicted one; refuse others."""
     expected_m = float(np.linalg.norm(prediction.position_m))
     off = math.log(pose.distance_m / expected_m)
     sd = math.hypot(
@@ -76,6 +79,7 @@ def _check_size(target: PlainTarget, prediction: PlainPrediction, pose: Pose) ->
     )
     if abs(off) > SIGMAS * sd:
         raise Rejection(Reason.UNLIKE_PREDICTION, f"its size is off by {math.exp(-off) - 1.0:+.0%}")
+    return (off / sd) ** 2
 
 
 def check_agreement(
@@ -84,14 +88,20 @@ def check_agreement(
     prediction: PlainPrediction,
     fit: CirclesFit,
     circles: int,
-) -> None:
+) -> float:
     """Refuse a measurement whose size, place or shape differs from the prediction.
+
+    Returns
+    -------
+    factor : float
+        By which its covariance is to be enlarged, at least 1. A shadow or a cover that changes size
+        and shape displaces the centre, too.
 
     Raises
     ------
     Rejection
     """
-    _check_size(target, prediction, fit.pose)
+    size_chi2 = _size_chi2(target, prediction, fit.pose)
     off_px = camera.project(fit.pose.translation_m[None])[0] - prediction.centre_px
     cov_px2 = prediction.cov_px2 + _PLACE_PX**2 * np.eye(2)
     if float(off_px @ np.linalg.solve(cov_px2, off_px)) > SIGMAS**2:
@@ -100,6 +110,8 @@ def check_agreement(
     freedom = 5 * circles - (3 if prediction.normal is not None else 5)
     if freedom and fit.chi2 > chdtri(freedom, _UNLIKELY):
         raise Rejection(Reason.UNLIKE_PREDICTION, f"shape: χ² {fit.chi2:.0f} of {freedom}")
+    per_freedom = (size_chi2 + (fit.chi2 if freedom else 0.0)) / (1 + freedom)
+    return max(1.0, per_freedom / _UNDISTURBED)
 
 
 def refuse_shared_edges(outcomes: Sequence[Outcome]) -> list[Outcome]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -205,11 +205,12 @@ def _checked(
         tolerant = fit_circles(
             camera, tolerated(circles.images), start, prediction.prior, prediction.rotation
         )
-        check_agreement(camera, target, prediction, tolerant, len(circles.discs))
-        fit, other = _best_fits(camera, circles.images, start, prediction)
+        factor = check_agreement(camera, target, prediction, tolerant, len(circles.discs))
+        images = replace(circles.images, covs=factor * circles.images.covs)
+        fit, other = _best_fits(camera, images, start, prediction)
     except np.linalg.LinAlgError:
         raise Rejection(Reason.POOR_FIT, "singular equations") from None
-    return _Candidate(circles, fit, other)
+    return _Candidate(replace(circles, images=images), fit, other)
 
 
 def _measured_on_texture(
