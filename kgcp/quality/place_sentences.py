@@ -19,7 +19,7 @@ _ROUGH_M = 10.0  # error of a position of unknown accuracy that is not doubted
 _ALIKE_SHARE = 0.2  # largest difference between errors that count as one, as a share of it
 _ROUGH_PX = 5.0  # noise of places from which on poses are rough
 _ROUGH_POSES = (
-    ", and rough poses without their standard deviations have targets too far away: state these"
+    "; targets seem too far away if poses are rougher than stated: state all errors of the poses"
 )
 _MIN_NOISE_PX = 0.005  # of additional noise that is reported
 
