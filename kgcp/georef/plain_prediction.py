@@ -15,7 +15,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.georef.exterior_orientation import ExteriorOrientations, visible_pixel
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.target_positions import TargetPositions
-from kgcp.measurement.plain_prediction import SIGMAS, PlainPrediction
+from kgcp.measurement.plain_prediction import PlainPrediction, PredictedPlace
 from kgcp.measurement.plate_prior import NormalPrior
 from kgcp.targets.plain import AnyTarget, PlainTarget
 
@@ -41,34 +41,6 @@ class MarkedPlace:
     x_px: float
     y_px: float
     sd_px: float  # standard deviation of either coordinate [px]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PredictedPlace:
-    """Where a static target must be in a frame."""
-
-    centre_px: FloatArray  # (2,): projected centre [px]
-    cov_px2: FloatArray  # (2, 2): its covariance [px²]
-    radius_px: float  # largest radius of its outer circle [px]
-
-    def contradiction_px(
-        self, place_px: FloatArray, sd_px: float = 0.0, sigmas: float = SIGMAS
-    ) -> float | None:
-        """Return how far off the target's place is, if this contradicts the prediction [px].
-
-        None: the standard deviations explain it.
-
-        Parameters
-        ----------
-        sd_px : float
-            Standard deviation of either coordinate of that place [px].
-        sigmas : float
-            How many standard deviations it may be off.
-        """
-        off_px = place_px - self.centre_px
-        cov_px2 = self.cov_px2 + sd_px**2 * np.eye(2)
-        is_far = float(off_px @ np.linalg.solve(cov_px2, off_px)) > sigmas**2
-        return float(np.linalg.norm(off_px)) if is_far else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,4 @@
-"""Where a plain target must be in a frame, how large, and how its plane lies."""
+"""Where a static target must be in a frame; of a plain one, how large, and how its plane lies."""
 
 from __future__ import annotations
 
@@ -25,6 +25,34 @@ for one.
 _FARTHEST = 16.0  # largest reach in radii that is searched
 _FREE_SD_DEG = 60.0  # prior of a free normal about the viewing ray
 _LEAST_COSINE = 0.17  # of the angle between normal and ray: 80°
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PredictedPlace:
+    """Where a static target must be in a frame."""
+
+    centre_px: FloatArray  # (2,): projected centre [px]
+    cov_px2: FloatArray  # (2, 2): its covariance [px²]
+    radius_px: float  # largest radius of its outer circle [px]
+
+    def contradiction_px(
+        self, place_px: FloatArray, sd_px: float = 0.0, sigmas: float = SIGMAS
+    ) -> float | None:
+        """Return how far off the target's place is, if this contradicts the prediction [px].
+
+        None: the standard deviations explain it.
+
+        Parameters
+        ----------
+        sd_px : float
+            Standard deviation of either coordinate of that place [px].
+        sigmas : float
+            How many standard deviations it may be off.
+        """
+        off_px = place_px - self.centre_px
+        cov_px2 = self.cov_px2 + sd_px**2 * np.eye(2)
+        is_far = float(off_px @ np.linalg.solve(cov_px2, off_px)) > sigmas**2
+        return float(np.linalg.norm(off_px)) if is_far else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

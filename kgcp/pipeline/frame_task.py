@@ -14,14 +14,13 @@ from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.geometry.camera import Camera, TimeReference
 from kgcp.geometry.circle_image import Circles3D, eccentricity
 from kgcp.geometry.conic import Ellipse
-from kgcp.georef.plain_prediction import PredictedPlace
 from kgcp.io.images.exif import Exif, read_exif
 from kgcp.io.images.frames import read_grey
 from kgcp.io.images.remote import StoredFolder, at_hand
 from kgcp.measurement.frame import examine, miss_of
 from kgcp.measurement.guided import Prediction, measure_guided
 from kgcp.measurement.plain_checks import refuse_shared_edges
-from kgcp.measurement.plain_prediction import PlainPrediction
+from kgcp.measurement.plain_prediction import PlainPrediction, PredictedPlace
 from kgcp.measurement.plain_target import measure_plain
 from kgcp.measurement.plate_prior import PlatePrior
 from kgcp.measurement.records import (

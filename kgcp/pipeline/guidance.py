@@ -14,7 +14,6 @@ from kgcp.geometry.camera import Camera
 from kgcp.georef.plain_neighbours import PlainTracks
 from kgcp.georef.plain_prediction import (
     FrameOrientation,
-    PredictedPlace,
     Predictions,
     predict_marked,
     predict_places,
@@ -27,6 +26,7 @@ from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.marks import HandMark
 from kgcp.measurement.guided import Prediction
+from kgcp.measurement.plain_prediction import PredictedPlace
 from kgcp.measurement.records import FrameResult, Measurement, Miss, is_unreadable
 from kgcp.network.ground.frame_poses import orient_frames, print_scale_sd
 from kgcp.quality.checks.static_targets import PlainSearch
