@@ -58,6 +58,9 @@ code_deg = [0, 43, 78, 180]
 TILTS = ((0.5, 0.0), (0.0, 0.5), (-0.5, 0.1), (0.1, -0.5), (0.35, 0.35))
 RUN = "kgcp.pipeline.calibration.run"
 QUIET = ("--jobs", "0", "--response", "linear", "--quiet")
+# for tests of anything else: as accurate as needed, and the lens and the sheet are not studied
+SIMPLE = ("--points", "fixed", "--model", "radial")
+FASTEST = (*SIMPLE, "--operator", "centroid")
 
 
 def run(*arguments: object) -> Result:
@@ -67,7 +70,7 @@ def run(*arguments: object) -> Result:
 @pytest.fixture
 def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave figures to the tests of the page: to draw them takes longer than to calibrate."""
-    names = ("residuals", "photographs", "rays", "distortion", "eccentricity", "field")
+    names = ("residuals", "photographs", "rays", "distortion", "eccentricity")
     monkeypatch.setattr(
         "kgcp.pipeline.calibration.results.draw_figures", lambda *_: dict.fromkeys(names, b"")
     )
@@ -242,7 +245,8 @@ def test_a_format_with_one_focal_length_does_not_force_it_on_the_camera(tmp_path
     take_photographs(folder, replace(CAMERA, fy=370.0))
     (folder / "field.toml").write_text(FIELD_TOML)
     formats = ("--format", "pix4d", "--format", "opencv", "--format", "mmvii")
-    result = run(folder, "--field", folder / "field.toml", "--out", out, *QUIET, "--json", *formats)
+    chosen = (*QUIET, "--points", "fixed", "--operator", "centroid", "--json", *formats)
+    result = run(folder, "--field", folder / "field.toml", "--out", out, *chosen)
     assert result.exit_code == 1
     assert result.stderr.startswith(
         "kgcp: error: pix4d, mmvii: left out, because fx and fy differ by "
@@ -262,7 +266,7 @@ def test_a_format_with_one_focal_length_does_not_force_it_on_the_camera(tmp_path
 @pytest.mark.usefixtures("_no_figures")
 def test_cameras_of_an_earlier_run_are_named(photos: Path, tmp_path: Path) -> None:
     (tmp_path / "opencv.yml").write_text("older")
-    options = ("--jobs", "0", "--response", "linear", "--operator", "centroid", "--format", "ros")
+    options = ("--jobs", "0", "--response", "linear", *FASTEST, "--format", "ros")
     result = run(photos, "--field", photos / "field.toml", "--out", tmp_path, *options, "--json")
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["not_renewed"] == ["opencv"]
@@ -295,13 +299,14 @@ def test_another_calibration_is_compared_with(
     """With itself there is no difference; with a longer lens, one that grows outwards."""
     own = calibration[0] / "camera.toml"
     field = photos / "field.toml"
-    chosen = ("--points", "fixed", "--model", "radial", "--operator", "centroid", "--json")
     camera = read_camera_file(own).camera
     longer = tmp_path / "longer.yml"
     calibrated = CalibratedCamera(replace(camera, fx=1.01 * camera.fx), np.eye(12), 0.0)
     longer.write_text(camera_file(calibrated, "opencv")[1])
     out = tmp_path / "out"
-    result = run(photos, "--field", field, "--out", out, *QUIET, *chosen, "--against", longer)
+    result = run(
+        photos, "--field", field, "--out", out, *QUIET, *FASTEST, "--json", "--against", longer
+    )
     assert result.exit_code == 0, result.output
     told = json.loads(result.stdout)["against"]
     assert told["file"] == "longer.yml"
@@ -310,7 +315,7 @@ def test_another_calibration_is_compared_with(
     assert "Against longer.yml" in (out / "calibration.html").read_text(encoding="utf-8")
     wide = tmp_path / "wide.toml"
     wide.write_text(own.read_text().replace("width = 400", "width = 401"))
-    options = ("--same-aspect", "--against", wide)
+    options = ("--same-aspect", *FASTEST, "--against", wide)
     result = run(photos, "--field", field, "--out", out, *QUIET, *options)
     assert result.exit_code == 1
     assert "wide.toml: is for frames of 401 x 300 px" in result.stderr
@@ -375,7 +380,7 @@ def test_too_few_photographs_are_one_line(photos: Path, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("_no_figures")
 def test_an_unusable_camera_is_an_error(photos: Path, tmp_path: Path) -> None:
     three = [photos / f"photo{number}.png" for number in (1, 2, 3)]
-    result = run(*three, "--field", photos / "field.toml", "--out", tmp_path, *QUIET)
+    result = run(*three, "--field", photos / "field.toml", "--out", tmp_path, *QUIET, *FASTEST)
     assert result.exit_code == 1
     assert result.stderr.startswith(
         f"kgcp: error: {tmp_path / 'camera.toml'}: is unusable: 3 photographs are fewer than 4"
@@ -474,7 +479,7 @@ def test_results_that_cannot_be_written_cost_no_measurements(
 ) -> None:
     obstacle = tmp_path / "calibration.html"
     obstacle.mkdir()
-    arguments = (photos, "--field", photos / "field.toml", "--out", tmp_path, *QUIET)
+    arguments = (photos, "--field", photos / "field.toml", "--out", tmp_path, *QUIET, *SIMPLE)
     failed = run(*arguments)
     assert f"{obstacle}: is a folder" in failed.stderr
     assert failed.exit_code == 1
@@ -495,7 +500,8 @@ def test_photographs_of_another_size_are_left_out(photos: Path, tmp_path: Path) 
     assert grey is not None
     cv2.imwrite(str(folder / "photo1.png"), np.rot90(grey))
     out = tmp_path / "out"
-    result = run(folder, "--field", folder / "field.toml", "--out", out, *QUIET, "--json")
+    options = (*QUIET, *FASTEST, "--json")
+    result = run(folder, "--field", folder / "field.toml", "--out", out, *options)
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["not_used"]["photo1.png"] == "other_size"
 

@@ -28,15 +28,6 @@ def run(*arguments: object) -> Result:
     return CliRunner().invoke(main, ["place", *map(str, arguments)], catch_exceptions=False)
 
 
-@pytest.fixture
-def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave figures to the tests of the page: to draw them takes longer than to place targets."""
-    monkeypatch.setattr(
-        "kgcp.pipeline.ground.place.draw_places",
-        lambda _: dict.fromkeys(("diameters", "frames", "positions"), b""),
-    )
-
-
 def test_targets_are_placed_and_their_diameters_measured(tmp_path: Path) -> None:
     flight = GroundFlight(diameter_m=0.8993, stated_diameter_m=0.9)
     folder = flight.write(tmp_path / "flight")
@@ -65,7 +56,7 @@ def test_targets_are_placed_and_their_diameters_measured(tmp_path: Path) -> None
     assert page.count('<li class="look">') == 5, "the diameters, that they agree, and no place"
 
 
-@pytest.mark.usefixtures("_no_figures")
+@pytest.mark.usefixtures("no_place_figures")
 @pytest.mark.parametrize(
     ("sd_position_m", "off_m", "words"),
     [
@@ -78,7 +69,7 @@ def test_targets_are_placed_and_their_diameters_measured(tmp_path: Path) -> None
 def test_positions_that_contradict_the_images_are_doubts(
     tmp_path: Path, sd_position_m: float, off_m: float, words: str | None
 ) -> None:
-    flight = GroundFlight()
+    flight = GroundFlight(frames=6)
     folder = flight.write(tmp_path / "flight", sd_position_m=sd_position_m)
     toml = folder / "flight.toml"
     x, y, z = flight.positions_map[1].tolist()
@@ -94,15 +85,16 @@ def test_positions_that_contradict_the_images_are_doubts(
         assert result.stderr.count(doubt) == 1
 
 
-@pytest.mark.usefixtures("_no_figures")
+@pytest.mark.usefixtures("no_place_figures")
 def test_a_rolling_shutter_needs_times(tmp_path: Path) -> None:
     """The camera's motion during the readout is unknown, and the deviations contain it."""
     folder = GroundFlight().write(tmp_path / "flight")
-    still = json.loads(run(folder, "--json").stdout)["targets"][0]
+    alone = ("--targets", "A", "--json")
+    still = json.loads(run(folder, *alone).stdout)["targets"][0]
     settings = folder / "flight.toml"
     text = settings.read_text(encoding="utf-8")
     settings.write_text(text.replace("[camera]", "[camera]\nreadout_s = 0.03"), encoding="utf-8")
-    result = run(folder, "--json")
+    result = run(folder, *alone)
     assert result.exit_code == 0, result.stderr
     assert (
         "the standard deviations assume 5°/s (motion_sd_deg_s); give the frames' times"
@@ -113,7 +105,7 @@ def test_a_rolling_shutter_needs_times(tmp_path: Path) -> None:
     assert target["frames_used"] == 12
 
 
-@pytest.mark.usefixtures("_no_figures")
+@pytest.mark.usefixtures("no_place_figures")
 def test_a_wrong_frame_is_left_out_and_named(tmp_path: Path) -> None:
     flight = GroundFlight(wrong={(3, "B"): np.array([0.4, 0.0, 0.0])})
     folder = flight.write(tmp_path / "flight")
@@ -151,7 +143,7 @@ def places_of(folder: Path) -> dict[str, np.ndarray]:
     return dict(zip(table["target"].tolist(), table[columns].to_numpy(), strict=True))
 
 
-@pytest.mark.usefixtures("_no_figures")
+@pytest.mark.usefixtures("no_place_figures")
 def test_a_wrong_focal_length_is_a_doubt_about_all_diameters(tmp_path: Path) -> None:
     """It places all targets wrongly, by 26 of their standard deviations."""
     flight = GroundFlight(stated_camera=replace(CAMERA, fx=2316.0, fy=2316.0), frames=6)
@@ -170,7 +162,7 @@ def undisturbed_places(names: str) -> dict[str, np.ndarray]:
         return places_of(flight)
 
 
-@pytest.mark.usefixtures("_no_figures")
+@pytest.mark.usefixtures("no_place_figures")
 @pytest.mark.parametrize(
     ("names", "frames", "off_m"),
     [
@@ -226,7 +218,7 @@ def stepped(names: str, steps_m: FloatArray, *, seed: int = 1) -> GroundFlight:
     return GroundFlight(names=tuple(names), offsets_m=offsets_m, seed=seed, wrong=wrong)
 
 
-@pytest.mark.usefixtures("_no_figures")
+@pytest.mark.usefixtures("no_place_figures")
 @pytest.mark.parametrize(
     ("names", "size_m", "frames"),
     [
@@ -262,7 +254,7 @@ def test_a_step_in_the_poses_is_not_taken_for_a_moved_target(
         assert target["poses_step"]["distance_m"] == pytest.approx(size_m, rel=0.5)
 
 
-@pytest.mark.usefixtures("_no_figures")
+@pytest.mark.usefixtures("no_place_figures")
 @pytest.mark.parametrize("names", ["A", "AB"])
 def test_standard_deviations_cover_drifting_poses(tmp_path: Path, names: str) -> None:
     ratios = []
@@ -281,7 +273,7 @@ def test_standard_deviations_cover_drifting_poses(tmp_path: Path, names: str) ->
     assert float(np.sqrt(np.mean(np.square(ratios)))) > 0.3
 
 
-@pytest.mark.usefixtures("_no_figures")
+@pytest.mark.usefixtures("no_place_figures")
 def test_a_step_within_the_stated_deviations_raises_no_doubt(tmp_path: Path) -> None:
     flight = stepped("A", np.outer(np.arange(12) >= 6, [0.02, 0.0, 0.0]))
     folder = flight.write(tmp_path / "flight")
@@ -294,7 +286,7 @@ def test_a_step_within_the_stated_deviations_raises_no_doubt(tmp_path: Path) -> 
     assert "another place" not in result.stderr
 
 
-@pytest.mark.usefixtures("_no_figures")
+@pytest.mark.usefixtures("no_place_figures")
 @pytest.mark.parametrize(("frames", "off_m"), [(4, 0.5), (6, 1.0)])
 def test_a_step_of_a_single_target_is_taken_for_a_moved_target(
     tmp_path: Path, frames: int, off_m: float
@@ -307,7 +299,7 @@ def test_a_step_of_a_single_target_is_taken_for_a_moved_target(
     assert "reference poses step" not in result.stderr
 
 
-@pytest.mark.usefixtures("_no_figures")
+@pytest.mark.usefixtures("no_place_figures")
 @pytest.mark.parametrize("frames", [4, 6])
 def test_a_target_at_two_distant_places_is_placed_by_most_frames_or_not_at_all(
     tmp_path: Path, frames: int
@@ -326,7 +318,7 @@ def test_a_target_at_two_distant_places_is_placed_by_most_frames_or_not_at_all(
         assert list(found) == ["A", "C", "D"]
 
 
-@pytest.mark.usefixtures("_no_figures")
+@pytest.mark.usefixtures("no_place_figures")
 def test_contradictions_that_frames_share_are_not_reduced_by_more_frames(tmp_path: Path) -> None:
     """Another target is taken for B in every second frame: no time at which it was moved."""
     rotations, east = GroundFlight(seed=4).rotations, np.array([1.0, 0.0, 0.0])
@@ -344,7 +336,7 @@ def test_contradictions_that_frames_share_are_not_reduced_by_more_frames(tmp_pat
     assert np.abs(z).max() < 3.0
 
 
-@pytest.mark.usefixtures("_no_figures")
+@pytest.mark.usefixtures("no_place_figures")
 def test_stated_deviations_of_poses_are_used(tmp_path: Path) -> None:
     folder = GroundFlight().write(tmp_path / "flight")
     path = folder / "reference.csv"
@@ -352,10 +344,11 @@ def test_stated_deviations_of_poses_are_used(tmp_path: Path) -> None:
     lines = [f"{line},0.02,0.02,0.03,0.01" for line in lines]
     text = "\n".join((f"{head},sd_x,sd_y,sd_z,sd_angle_deg", *lines))
     path.write_text(f"{text}\n", encoding="utf-8")
-    exact = json.loads(run(folder, "--eo", "fixed", "--json").stdout)["targets"][0]
+    alone = ("--targets", "A", "--json")
+    exact = json.loads(run(folder, "--eo", "fixed", *alone).stdout)["targets"][0]
     page = (folder / "kgcp" / "places.html").read_text(encoding="utf-8")
     assert 'class="verdict good"' in page
-    free = json.loads(run(folder, "--json").stdout)["targets"][0]
+    free = json.loads(run(folder, *alone).stdout)["targets"][0]
     assert free["sd_position_m"][0] > 0.02 > 10.0 * exact["sd_position_m"][0]
 
 
@@ -410,15 +403,15 @@ def test_options_that_name_nothing_to_place_are_usage_errors(
 
 
 def test_target_names_cannot_become_spreadsheet_formulas(tmp_path: Path) -> None:
-    folder = GroundFlight(names=("P$^$", "B", "C", "D")).write(tmp_path / "flight")
+    folder = GroundFlight(names=("P$^$", "B", "C", "D"), frames=3).write(tmp_path / "flight")
     result = run(folder)
     assert result.exit_code == 0, result.stderr
     assert "P$^$" in (folder / "kgcp" / "places.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.usefixtures("_no_figures")
+@pytest.mark.usefixtures("no_place_figures")
 def test_files_of_an_earlier_run_are_named(tmp_path: Path) -> None:
-    folder = GroundFlight().write(tmp_path / "flight")
+    folder = GroundFlight(frames=3).write(tmp_path / "flight")
     assert "earlier run" not in run(folder, "--format", "odm").stderr
     result = run(folder, "--format", "csv", "--json")
     assert "not updated, from an earlier run: odm\n" in result.stderr
@@ -443,7 +436,7 @@ def test_heights_of_another_kind_are_a_grave_doubt_of_the_export(tmp_path: Path)
         arguments = ["export-gcp", str(folder), "--format", "csv"]
         return CliRunner().invoke(main, arguments, catch_exceptions=False)
 
-    flight = GroundFlight()
+    flight = GroundFlight(frames=4)
     folder = flight.write(tmp_path / "flight")
     size = (CAMERA.height, CAMERA.width)
     for name in flight.frame_names:
