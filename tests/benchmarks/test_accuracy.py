@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from benchmarks.accuracy.bands import join_truth, summarise, table_lines
 from benchmarks.accuracy.bound import frame_bound
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
+from kgcp.pipeline.detect import RunOptions
 from kgcp.settings import DetectSettings
 from kgcp.simulation.crlb import (
     Shot,
@@ -277,6 +279,14 @@ def test_methods_without_sigmas_leave_dashes() -> None:
     results = summarise(join_truth(rows, truth))
     assert all(math.isnan(band.mahalanobis2) for band in results)
     assert all("–" in line for line in list(table_lines(results))[1:])
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _detections_in_this_process() -> Iterator[None]:
+    """To start a worker for three small frames would take longer than to measure them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluate, "RunOptions", lambda *, jobs: RunOptions(jobs=jobs - 1))
+        yield
 
 
 @pytest.fixture(scope="module")

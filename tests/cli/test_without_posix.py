@@ -100,13 +100,11 @@ def test_characters_missing_in_a_code_page_do_not_stop_a_command(
 ) -> None:
     toml = flight / "flight.toml"
     toml.write_text(toml.read_text("utf-8").replace("-1.95", "1.95"), "utf-8")
-    for arguments in (("check", str(flight)), ("export-gcp", "--help")):
-        run = kgcp(windows, *arguments)
+    checked, helped = kgcp(windows, "check", str(flight)), kgcp(windows, "export-gcp", "--help")
+    for run in (checked, helped):
         assert run.returncode == 0, run.stderr
         assert "?" not in run.stdout
-    assert "lever arm puts the target 1.95 m below" in " ".join(
-        kgcp(windows, "check", str(flight)).stdout.split()
-    )
+    assert "lever arm puts the target 1.95 m below" in " ".join(checked.stdout.split())
 
 
 def test_init_works_on_windows(windows: dict[str, str], flight: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from dataclasses import replace
 from types import SimpleNamespace
@@ -79,9 +80,21 @@ def calibrated(
     return calibrate_camera(made, FIELD, (1600, 1200), CalibrationSettings(points, lens))
 
 
+@functools.cache
+def good_calibration() -> CameraCalibration:
+    """The calibration of exact photographs of the stated field, by a lens that is chosen."""
+    return calibrated(views(), lens=LensModel.AUTO)
+
+
+@pytest.fixture
+def _none_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the search for photographs that stand apart, which finds none and takes long."""
+    monkeypatch.setattr("kgcp.network.calibration.photographs_apart", lambda *_: ())
+
+
 def test_a_good_calibration_is_called_good() -> None:
     """The eccentricity of large discs leaves nothing in focal length and principal point."""
-    result = calibrated(views(), lens=LensModel.AUTO)
+    result = good_calibration()
     numbers = calibration_numbers(result)
     verdict = judge(result, numbers)
     assert verdict.grade is CalibrationGrade.GOOD, verdict.sentence
@@ -126,11 +139,14 @@ def test_terms_that_are_not_significant_absorb_no_errors_of_a_field() -> None:
     assert result.camera.cy == pytest.approx(583.0, abs=1.0)
 
 
-@pytest.mark.parametrize("points", [PointModel.STIFF, PointModel.FREE])
-def test_the_only_disc_with_wrong_coordinates_is_named(points: PointModel) -> None:
+@pytest.mark.parametrize(
+    ("points", "lens"),
+    [(PointModel.STIFF, LensModel.AUTO), (PointModel.FREE, LensModel.RADIAL)],
+)
+def test_the_only_disc_with_wrong_coordinates_is_named(points: PointModel, lens: LensModel) -> None:
     errors_m = np.zeros((len(FIELD.names()), 3))
     errors_m[13] = 0.002, 0.001, 0.0
-    result = calibrated(views(bend_m=errors_m), points, LensModel.AUTO)
+    result = calibrated(views(bend_m=errors_m), points, lens)
     verdict = judge(result, calibration_numbers(result))
     assert verdict.grade is CalibrationGrade.LOOK
     assert re.search(rf"disc {FIELD.names()[13]} alone by 2\.\d+ mm", verdict.sentence)
@@ -142,6 +158,7 @@ def test_two_focal_lengths_are_estimated_where_they_differ() -> None:
     assert "fy" not in wider.tangled
 
 
+@pytest.mark.usefixtures("_none_apart")
 def test_two_focal_lengths_are_advised_where_one_fits_badly_and_two_were_not_tried() -> None:
     hint = "Estimate two focal lengths: the pixels may not be square."
     made = views(camera=replace(CAMERA, fy=1530.0))
@@ -151,6 +168,7 @@ def test_two_focal_lengths_are_advised_where_one_fits_badly_and_two_were_not_tri
     assert hint not in judge(chosen, calibration_numbers(chosen)).advice
 
 
+@pytest.mark.usefixtures("_none_apart")
 @pytest.mark.parametrize("points", [PointModel.FIXED, PointModel.STIFF])
 def test_a_rational_model_keeps_its_terms_small_on_a_field_with_errors(points: PointModel) -> None:
     """The errors must not drive k1 and k4 against each other, to a pole between the discs."""
@@ -192,8 +210,10 @@ def test_a_field_that_is_not_flat_is_noticed_and_estimated() -> None:
 
 @pytest.mark.parametrize("points", [PointModel.STIFF, PointModel.FREE])
 def test_a_sheet_that_bends_between_photographs_is_reported_if_it_is_free(
-    points: PointModel,
+    points: PointModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if points is PointModel.STIFF:  # the free sheet shows that no photograph is left out for it
+        monkeypatch.setattr("kgcp.network.calibration.photographs_apart", lambda *_: ())
     rng = np.random.default_rng(9)
     amounts = 0.0001 * rng.standard_normal((len(TURNS), 3))
     result = calibrated(views(bend_m=_heights_m(amounts)), points)
@@ -277,19 +297,23 @@ def test_a_larger_field_is_reported_if_a_distance_was_measured() -> None:
     assert "in its plane" in field.doubt
 
 
-def barred(*lengths: float, points: PointModel = PointModel.STIFF) -> CameraCalibration:
+def barred(
+    *lengths: float,
+    points: PointModel = PointModel.STIFF,
+    lens: LensModel = LensModel.RADIAL,
+) -> CameraCalibration:
     """Return a calibration of the field with bars along its first row and its first column."""
     ends = (("r0c0", "r0c5", 0.2), ("r0c0", "r4c0", 0.16))
     bars = tuple(
         FieldBar(first, last, share * length_m, 0.00002)
         for share, (first, last, length_m) in zip(lengths, ends, strict=False)
     )
-    settings = CalibrationSettings(points, LensModel.AUTO)
+    settings = CalibrationSettings(points, lens)
     return calibrate_camera(views(), replace(FIELD, bars=bars), (1600, 1200), settings)
 
 
 def test_a_stiff_field_has_the_length_that_was_measured() -> None:
-    result = barred(1.0005)
+    result = barred(1.0005, lens=LensModel.AUTO)
     (residual_m,) = result.bar_residuals_m
     assert abs(residual_m) < 0.00002
     assert judge(result, calibration_numbers(result)).grade is CalibrationGrade.GOOD
@@ -355,6 +379,7 @@ def from_two_distances(
     return made
 
 
+@pytest.mark.usefixtures("_none_apart")
 def test_a_focal_length_that_changes_with_the_distance_is_reported() -> None:
     """Poses absorb the change so well that the discs fit: nothing else shows it."""
     result = calibrated(from_two_distances(0.004), PointModel.STIFF)
@@ -369,6 +394,7 @@ def test_a_focal_length_that_changes_with_the_distance_is_reported() -> None:
     assert any("Switch the autofocus off" in sentence for sentence in verdict.advice)
 
 
+@pytest.mark.usefixtures("_none_apart")
 @pytest.mark.parametrize(
     ("points", "noise_px"), [(PointModel.FIXED, SD_PX), (PointModel.STIFF, 4.0 * SD_PX)]
 )
@@ -589,11 +615,10 @@ def test_the_principal_point_of_cropped_photographs_is_found_outside_them(cx: fl
     assert result.camera.fx == pytest.approx(1500.0, abs=0.2)
 
 
+@pytest.mark.usefixtures("_none_apart")
 def test_a_diverging_principal_point_is_held_at_the_border_and_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """None of them stands apart; the search for such ones, which takes long, is left out."""
-    monkeypatch.setattr("kgcp.network.calibration.photographs_apart", lambda *_: ())
     made, border = views(camera=replace(CAMERA, cx=2399.9)), 1599.0
     result = calibrated(made)
     assert result.camera.cx == border
@@ -697,7 +722,7 @@ def test_a_fisheye_is_reported() -> None:
 
 
 def test_negatives_are_reported_for_checking() -> None:
-    result = calibrated(views(), lens=LensModel.AUTO)
+    result = good_calibration()
     verdict = judge(result, calibration_numbers(result, DiscLight(0.07, 0.01, 0.0)))
     assert verdict.grade is CalibrationGrade.LOOK
     assert "they are negatives" in verdict.sentence
@@ -709,7 +734,7 @@ def in_burst(made: list[NamedView]) -> list[NamedView]:
 
 
 def test_a_burst_counts_as_one_place() -> None:
-    result = calibrated(in_burst(views()), lens=LensModel.AUTO)
+    result = calibrated(in_burst(views()))
     numbers = calibration_numbers(result)
     assert (numbers.views, numbers.places) == (12, 6)
     verdict = judge(result, numbers)

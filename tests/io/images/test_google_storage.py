@@ -97,7 +97,7 @@ def test_a_flight_in_googles_store_gives_the_bytes_of_a_local_one(
     name: str, query: str, flight: Path, expected: bytes
 ) -> None:
     stored = f"gs://anonymous@flights/{name}{query}"
-    done = CliRunner().invoke(main, ["detect", stored, "--jobs", "1", "--json", "-q"])
+    done = CliRunner().invoke(main, ["detect", stored, "--jobs", "0", "--json", "-q"])
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["table"] == f"gs://flights/{name}/kgcp/detections.parquet"
     assert content(query, f"{name}/kgcp/detections.parquet") == expected
