@@ -32,6 +32,22 @@ def pytest_sessionstart(session: pytest.Session) -> None:
             list(pool.map(abs, range(jobs)))
 
 
+@pytest.fixture(scope="module")
+def fewest_sub_pixels() -> Iterator[None]:
+    """Render all plates and discs by 4 × 4 sub-pixels per pixel, as large ones, not up to 10 × 10.
+
+    Each is covered exactly, but for the bend of an edge within it. On a plate, no pixel's light
+    changes by more than 0.0024 of white, RMS 0.00003; on discs of R 3 to 18 px by 0.0011, RMS
+    0.00004, and their area by 6 · 10⁻⁶. Noise is 0.01. Rendering took longer than measuring.
+    """
+    from kgcp.simulation import disc_field, plate
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plate, "_SUB_PIXELS_ACROSS", 1)
+        patch.setattr(disc_field, "_SUB_PIXELS_ACROSS", 1)
+        yield
+
+
 @pytest.fixture
 def sigint_raises() -> Iterator[None]:
     """Let SIGINT raise `KeyboardInterrupt` here, and by default end processes started here.

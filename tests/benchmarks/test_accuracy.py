@@ -30,6 +30,8 @@ from kgcp.simulation.flight import TARGET_PLATE, FramePlan, plan_flight
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 from kgcp.simulation.presets import SimulationSettings, preset
 
+pytestmark = pytest.mark.usefixtures("fewest_sub_pixels")
+
 SMALL = Camera(
     width=480, height=360, fx=1800.0, fy=1797.0, cx=243.1, cy=176.2, k1=-0.05,
     response=preset("clean").camera.response,

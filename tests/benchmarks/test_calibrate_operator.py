@@ -10,6 +10,8 @@ import pytest
 from benchmarks.calibrate.operator import Outcome, Setup, line, measure
 from kgcp.measurement.discs.records import Operator, Polarity
 
+pytestmark = pytest.mark.usefixtures("fewest_sub_pixels")
+
 
 @cache
 def outcome(case: str, used: Operator = Operator.MODEL, ratio: float = 0.8) -> Outcome:

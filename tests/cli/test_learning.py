@@ -16,6 +16,8 @@ from kgcp.pipeline.simulate import write_simulated_flight
 from kgcp.simulation.flight import plan_flight
 from kgcp.simulation.presets import preset
 
+pytestmark = pytest.mark.usefixtures("fewest_sub_pixels")
+
 FRAMES = 7
 
 

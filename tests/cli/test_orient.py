@@ -34,6 +34,8 @@ from kgcp.targets.fields.layout import Field, GridKind, Mark
 from tests.ground_flight import CAMERA as TRUE_CAMERA
 from tests.ground_flight import GroundFlight
 
+pytestmark = pytest.mark.usefixtures("fewest_sub_pixels")
+
 
 def run(command: str, *arguments: object) -> Result:
     return CliRunner().invoke(main, [command, *map(str, arguments)], catch_exceptions=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -18,7 +18,6 @@ from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.image_model.plate import circles_of
 from kgcp.measurement.image_model.window import contour_px, cut_window, semi_major_axis_px
 from kgcp.measurement.records import InitialPose
-from kgcp.simulation import plate as plate_rendering
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.light_field import PlateLight
@@ -31,15 +30,8 @@ PlacePlate = Callable[..., Pose]
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _fewest_sub_pixels() -> Iterator[None]:
-    """Render all plates by 4 × 4 sub-pixels per pixel, as large ones, instead of up to 8 × 8.
-
-    Each is covered exactly, but for the bend of an edge within it: no pixel's light changes by more
-    than 0.0024 of white, RMS 0.00003, and noise is 0.01. Rendering took longer than measuring.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plate_rendering, "_SUB_PIXELS_ACROSS", 1)
-        yield
+def _quickly_rendered(fewest_sub_pixels: None) -> None:
+    """Render all plates and discs by few sub-pixels."""
 
 
 @pytest.fixture(scope="session")

@@ -29,6 +29,8 @@ from kgcp.pipeline.execution.journal import Journal, fingerprint
 from kgcp.pipeline.execution.resilient_map import SerialExecutor, TaskFailure
 from kgcp.targets.fields.layout import Field, GridKind
 
+pytestmark = pytest.mark.usefixtures("fewest_sub_pixels")
+
 
 class LosingPool(WorkerPool):
     """A pool that loses every job."""

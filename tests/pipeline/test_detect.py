@@ -27,6 +27,8 @@ from kgcp.simulation.flight import plan_flight
 from kgcp.simulation.imaging import Sensor
 from kgcp.simulation.presets import preset
 
+pytestmark = pytest.mark.usefixtures("fewest_sub_pixels")
+
 LEVEL = ("sd_time_s = ", "level_sd_deg = 2.0\nsd_time_s = ")
 FRAMES = 6
 

@@ -50,6 +50,8 @@ from tests.plain_flight import (
 )
 from tests.systems import share
 
+pytestmark = pytest.mark.usefixtures("fewest_sub_pixels")
+
 FOUR = (*TARGETS, plain_target("fourth", (0.3, -3.3), 0.8))
 FLIGHT = PlainFlight(targets=FOUR, moving=Target(coded_ring("car", (0, 43, 78, 180))))
 

@@ -26,6 +26,8 @@ from kgcp.simulation.presets import preset
 from kgcp.targets.fields.layout import Field, GridKind, Mark
 from kgcp.targets.fields.points import CodeRing, FieldPoint, PointField
 
+pytestmark = pytest.mark.usefixtures("fewest_sub_pixels")
+
 CAMERA = Camera(320, 240, 330.0, 330.0, 163.0, 117.5, -0.08, response=Response.LINEAR)
 SETTINGS = replace(preset("clean"), camera=CAMERA, frames=5)
 FIELD = Field(

@@ -32,6 +32,8 @@ from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 from kgcp.simulation.plate import image_plate
 from tests.flight_toml import RING_A, camera_table
 
+pytestmark = pytest.mark.usefixtures("fewest_sub_pixels")
+
 CAMERA = Camera(320, 240, 900.0, 904.0, 156.3, 124.2)
 FRAMES, ASKED = 12, 8
 FLIGHT = f'{camera_table(CAMERA)}response = "unknown"\n{RING_A}'

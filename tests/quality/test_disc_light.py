@@ -15,6 +15,8 @@ from kgcp.quality.disc_light import DiscLight, light_on_discs
 from kgcp.simulation.field_session import FieldSession, field_photograph, printed_points
 from kgcp.targets.fields.layout import Field, FieldPolarity, GridKind, Mark
 
+pytestmark = pytest.mark.usefixtures("fewest_sub_pixels")
+
 PLACES_PX = np.stack(np.meshgrid(np.arange(7.0), np.arange(5.0)), axis=-1).reshape(-1, 2) * 80.0
 
 

@@ -60,8 +60,8 @@ def _vehicle(column: int, change: Callable[[FloatArray], FloatArray]) -> Callabl
 def _without_satellites(one: Flight) -> Flight:
     """A receiver that repeats its position from the middle on, once a second."""
     vehicle = one.vehicle.copy()
-    vehicle[440:, :3] = vehicle[440, :3]
-    return replace(one, vehicle=vehicle[::20], vehicle_s=one.vehicle_s[::20])
+    vehicle[220:, :3] = vehicle[220, :3]
+    return replace(one, vehicle=vehicle[::10], vehicle_s=one.vehicle_s[::10])
 
 
 def _reference(

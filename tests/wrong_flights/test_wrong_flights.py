@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import pytest
 
 from kgcp.errors import KgcpError
 from kgcp.io.flight.flight import read_flight
+from kgcp.io.images.exif import read_frame_header
 from kgcp.pipeline.check import check_flight
 from kgcp.pipeline.export import make_gcps
 from kgcp.quality.checks.doubt import Cause, Doubt
+from kgcp.quality.checks.frame_header import FrameHeader
 from tests.wrong_flights.flights import (
+    SAMPLE,
     Flight,
     drone_pictures,
     flight,
@@ -24,6 +27,20 @@ from tests.wrong_flights.flights import (
 from tests.wrong_flights.slips import ANYWAY, PAIRS, WITH_REFERENCE, WITHOUT_REFERENCE, Slip
 
 SHARED = Path(__file__).resolve().parents[2] / ".." / "shared" / "flights"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _headers_of_the_sample_read_once() -> Iterator[None]:
+    """The frames of most flights are links to those of the sample flight, which do not change."""
+    of_sample = cache(read_frame_header)
+
+    def header(path: Path, frame: str) -> FrameHeader:
+        real = path.resolve()
+        return (of_sample if real.parent == SAMPLE / "frames" else read_frame_header)(real, frame)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("kgcp.pipeline.flight_inputs.read_frame_header", header)
+        yield
 
 
 @dataclass(frozen=True)

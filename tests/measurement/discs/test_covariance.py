@@ -103,7 +103,7 @@ def test_deviations_of_discs_in_jpegs_agree_with_their_errors() -> None:
     stated: list[FloatArray] = []
     aside: list[FloatArray] = []
     errors: list[FloatArray] = []
-    for _ in range(2):
+    for number in range(2):
         middles = (lattice + rng.uniform(-4.0, 4.0, lattice.shape)) / 2e5
         discs = tuple(
             SimulatedDisc((x, y, 0.0), 10.0 / 2e5, 0.0, tilt) for x, y in middles.tolist()
@@ -111,7 +111,8 @@ def test_deviations_of_discs_in_jpegs_agree_with_their_errors() -> None:
         scene = FieldScene(discs, 0.62, 0.1)
         photo = compressed(photograph(camera, pose, scene, Optics(0.6), Sensor(), rng), 92)
         truth = circle_images(camera, field_circles(pose, discs)).moments
-        for image, sds in ((photo, stated), (photo[4:, 4:].copy(), aside)):
+        shown = [(photo, stated), (photo[4:, 4:].copy(), aside)]
+        for image, sds in shown[: 2 - number]:
             outcomes = measure_discs(image, find_outlines(image), response=Response.LINEAR)
             found = [disc for disc in outcomes if isinstance(disc, Disc)]
             sds += [np.sqrt(np.diag(disc.cov)[:2]) for disc in found]

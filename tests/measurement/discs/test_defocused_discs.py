@@ -42,6 +42,7 @@ def light_of(scene: FieldScene, defocus_px: float) -> FloatArray:
     return field_irradiance(CAMERA, POSE, scene, optics)
 
 
+@functools.cache
 def radius_errors_px(
     defocus_px: float, sensor: Sensor, response: Response, gain: float, quality: int = 0
 ) -> tuple[FloatArray, FloatArray, float]:
