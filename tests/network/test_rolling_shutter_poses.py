@@ -139,7 +139,9 @@ def test_deviations_cover_unknown_motion(targets: int) -> None:
 
 
 def test_the_camera_s_rates_make_poses_more_certain() -> None:
-    rng, sds, z = np.random.default_rng(6), [], []
+    rng, z = np.random.default_rng(6), []
+    with_rates: list[float] = []
+    without_rates: list[float] = []
     for seed in range(4):  # the errors of positions are those of all frames
         flight = GroundFlight(NAMES[:5], OFFSETS_M[:5], frames=3, seed=seed)
         places = places_of(flight, rng)
@@ -148,17 +150,19 @@ def test_the_camera_s_rates_make_poses_more_certain() -> None:
             turn = 2.0 * SD_RAD_S * rng.standard_normal(3)
             sightings += sightings_of(flight, row, np.append(np.zeros(3), turn), rng)
             rotations[frame] = scene_rotation(flight, row, turn, 0.02 * SD_RAD_S)
-        for known in ({}, rotations):
+        # without rates, half of the flights are enough: their deviations are nearly the same
+        for known in ({}, rotations) if seed < 2 else (rotations,):
             poses = orient_frames(
                 flight.frame_names, sightings, places, CAMERA, sd_scale=0.0, rotations=known
             )
             assert all(found.cov is not None for found in poses)
-            sds.append([np.sqrt(found.cov[4, 4]) for found in poses if found.cov is not None])
+            sds = with_rates if known else without_rates
+            sds += [np.sqrt(found.cov[4, 4]) for found in poses if found.cov is not None]
         z += [
             error_of(found, CameraPose(flight.centres[row], flight.rotations[row]))
             for row, found in enumerate(poses)
         ]
-    assert float(np.median(sds[1::2])) < 0.7 * float(np.median(sds[::2]))
+    assert float(np.median(with_rates)) < 0.7 * float(np.median(without_rates))
     assert 0.7 < float(np.sqrt(np.mean(np.square(z)))) < 1.3
 
 

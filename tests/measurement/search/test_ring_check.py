@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import cv2
@@ -9,13 +10,23 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 from kgcp.measurement.search.pyramid import Pyramid, build_pyramid, reduction_factor
 from kgcp.measurement.search.ring_check import check_peaks
 
 BLACK, WHITE = 40, 190
 PEAK_RADIUS_PX = 2.8
 RING, NEAR, FAR, CORE = 0.76, 1.15, 1.34, 0.33
+
+
+@functools.cache
+def circle(radius: float, count: int) -> tuple[IndexArray, IndexArray]:
+    """Columns and rows of a circle's pixels, from its middle: there are few radii."""
+    angles = 2.0 * np.pi / count * (np.arange(count) + 0.5)
+    return (
+        np.floor(radius * np.cos(angles) + 0.5).astype(np.intp),
+        np.floor(radius * np.sin(angles) + 0.5).astype(np.intp),
+    )
 
 
 class PlainCheck:
@@ -26,13 +37,11 @@ class PlainCheck:
 
     def samples(self, radius: float, count: int) -> np.ndarray:
         """Grey values on a circle; the image repeats its last pixels."""
-        angles = 2.0 * np.pi / count * (np.arange(count) + 0.5)
+        columns, rows = circle(radius, count)
         height, width = self.image.shape
-        column = self.x + np.floor(radius * np.cos(angles) + 0.5).astype(int)
-        row = self.y + np.floor(radius * np.sin(angles) + 0.5).astype(int)
-        return np.asarray(
-            self.image[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)].astype(int)
-        )
+        column = np.minimum(np.maximum(self.x + columns, 0), width - 1)
+        row = np.minimum(np.maximum(self.y + rows, 0), height - 1)
+        return np.asarray(self.image[row, column].astype(int))
 
     def directions(self, radius: float, count: int) -> int:
         """In how many directions a dark ring is followed by something brighter."""

@@ -34,6 +34,29 @@ def defined_score(
     return float(share @ (image * patch) / np.sqrt((share @ image**2) * (share @ patch**2)))
 
 
+def defined_scores(image: FloatArray, patch: FloatArray, weights: FloatArray) -> list[float]:
+    """`defined_score` of an image turned by every angle, all of which is visible."""
+    share = np.repeat(weights, ANGLES)
+    lags = (np.arange(ANGLES) - np.arange(ANGLES)[:, None]) % ANGLES  # as by np.roll
+    turned = np.moveaxis(image[:, lags], 1, 0).reshape(ANGLES, -1)
+    turned = turned - np.average(turned[0], weights=share)
+    own = patch.ravel() - np.average(patch.ravel(), weights=share)
+    squares = (share @ turned[0] ** 2) * (share @ own**2)
+    scores: list[float] = (turned @ (share * own) / np.sqrt(squares)).tolist()
+    return scores
+
+
+def test_scores_of_all_turns_equal_the_definition(target: Target) -> None:
+    templates = templates_of(target.ring)
+    image, patch = templates.images[3], some_light(templates.images.shape[1], 2)
+    everywhere = np.ones(ANGLES, dtype=bool)
+    scores = defined_scores(image, patch, templates.weights)
+    for turn in (0, 1, 31):
+        turned = np.roll(image, turn, axis=1)
+        expected = defined_score(turned, patch, templates.weights, everywhere)
+        assert scores[turn] == pytest.approx(expected, abs=1e-12)
+
+
 @pytest.mark.parametrize("hidden", [0, 1, 37, 55])
 @pytest.mark.parametrize("shape", [(3, 4, 48, 6), (1, 1, 60, 1), (2, 5, 30, 3)])
 def test_scores_equal_the_definition(shape: tuple[int, ...], hidden: int) -> None:
@@ -70,14 +93,11 @@ def test_best_placement_is_the_maximum_over_lags_and_shifts(target: Target, seed
     patch = 2.0 * some_light(rows + 2 * SHIFTS, seed)
     patch[shift : shift + rows] += 50.0 * np.roll(templates.images[index], lag, axis=1)
     score, *place = best_placement(correlate(patch, templates))
-    everywhere = np.ones(ANGLES, dtype=bool)
     scores = [
-        defined_score(
-            np.roll(image, turn, axis=1), patch[s : s + rows], templates.weights, everywhere
-        )
+        by_turn
         for image in templates.images
         for s in range(2 * SHIFTS + 1)
-        for turn in range(ANGLES)
+        for by_turn in defined_scores(image, patch[s : s + rows], templates.weights)
     ]
     assert score == pytest.approx(max(scores), abs=5e-3)  # higher frequencies are left out
     index = int(np.ravel_multi_index(place, (len(templates.images), 2 * SHIFTS + 1, ANGLES)))
