@@ -43,17 +43,19 @@ def _drive(time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
     return _LOCAL_FRAME.map_from_enu(enu), -np.degrees(angle)
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    (tmp_path / "frames").mkdir()
-    (tmp_path / "flight.toml").write_text(ON_A_VEHICLE, encoding="utf-8")
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the flight, which nobody changes."""
+    folder = tmp_path_factory.mktemp("written") / "flight"
+    (folder / "frames").mkdir(parents=True)
+    (folder / "flight.toml").write_text(ON_A_VEHICLE, encoding="utf-8")
     rng = np.random.default_rng(4)
     times = np.arange(0.0, 1.5 * _FRAMES + 4.0, 0.1)
     lines = ["time,x,y,z,roll_deg,pitch_deg,heading_deg,sd_x,sd_y,sd_z"]
     for t, xyz, heading in zip(times, *_drive(times), strict=True):
         place = ",".join(f"{value:.5f}" for value in xyz)
         lines.append(f"{_UNIX_S + t:.1f},{place},0,0,{heading:.6f},0.01,0.01,0.01")
-    (tmp_path / "vehicle.csv").write_text("\n".join(lines), encoding="utf-8")
+    (folder / "vehicle.csv").write_text("\n".join(lines), encoding="utf-8")
     rows, reference = [], ["frame,x,y,z,omega_deg,phi_deg,kappa_deg,sd_x,sd_y,sd_z,sd_angle_deg"]
     for index in range(_FRAMES):
         t = 2.0 + 1.5 * index
@@ -62,12 +64,18 @@ def folder(tmp_path: Path) -> Path:
         place = ",".join(f"{value:.5f}" for value in camera + 0.01 * rng.standard_normal(3))
         reference.append(f"f_{index:02d}.jpg,{place},0,0,0,0.01,0.01,0.01,0.002")
         rows.append(_detection(index, t - _LATE_S, _in_camera(camera, target)))
-    (tmp_path / "reference.csv").write_text("\n".join(reference), encoding="utf-8")
+    (folder / "reference.csv").write_text("\n".join(reference), encoding="utf-8")
     rows[20] |= {"distance_m": float(str(rows[20]["distance_m"])) + 2.0}
     rows[5] |= {"score": 0.88}
     rows[7] |= {"ambiguity": 3.0}
-    write_table(tmp_path / "kgcp" / "detections.parquet", DETECTION_COLUMNS, rows, {})
-    return tmp_path
+    write_table(folder / "kgcp" / "detections.parquet", DETECTION_COLUMNS, rows, {})
+    return folder
+
+
+@pytest.fixture
+def folder(written: Path, tmp_path: Path) -> Path:
+    """A copy of the flight."""
+    return Path(shutil.copytree(written, tmp_path, dirs_exist_ok=True))
 
 
 def _in_camera(camera: FloatArray, target: FloatArray) -> FloatArray:

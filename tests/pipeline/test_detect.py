@@ -31,6 +31,7 @@ pytestmark = pytest.mark.usefixtures("fewest_sub_pixels")
 
 LEVEL = ("sd_time_s = ", "level_sd_deg = 2.0\nsd_time_s = ")
 FRAMES = 6
+SMALL = replace(preset("far").camera, width=800, height=600, cx=404.2, cy=297.1)
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +39,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Far and noisy, from a tilted camera: the image cannot tell the two poses apart."""
     settings = replace(
         preset("far"),
+        camera=SMALL,
         sensor=Sensor(full_well_e=2000.0, read_noise_e=20.0),
         frames=FRAMES,
         distance_m=(105.0, 130.0),
@@ -68,7 +70,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """So far that the search passes over some of the rings; trajectory and reference are there."""
     settings = replace(
         preset("far"),
-        camera=replace(preset("far").camera, width=800, height=600, cx=404.2, cy=297.1),
+        camera=SMALL,
         frames=12,
         distance_m=(100.0, 215.0),
         absent_share=0.17,
