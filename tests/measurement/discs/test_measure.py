@@ -71,9 +71,9 @@ def bright() -> Rendered:
 def sharpened(light: float, sharpening: float) -> Rendered:
     """Large discs by a camera that sharpens: beside their edges is a fainter one."""
     discs = tuple(
-        SimulatedDisc((0.07 * i, 0.07 * j, 0.0), 0.045, 0.02 if i == j == 0 else 0.0)
-        for j in (-1, 0, 1)
-        for i in (-1, 0, 1)
+        SimulatedDisc((0.07 * i, 0.07 * j, 0.0), 0.045, 0.02 if i == j < 0 else 0.0)
+        for j in (-0.5, 0.5)
+        for i in (-0.5, 0.5)
     )
     scene = FieldScene(discs, 0.7 * light, 0.05 * light)
     sensor = Sensor(tone=ToneCurve.FILM, sharpening=sharpening, sharpening_px=1.1)
@@ -95,12 +95,12 @@ def test_overshoots_of_sharpening_hide_no_disc(light: float, sharpening: float) 
     """An overshoot was once taken for a hole, and discs were measured without their ink."""
     rendered = sharpened(light, sharpening)
     outlines = find_outlines(rendered.photo)
-    assert len(outlines) == 10
+    assert len(outlines) == 5
     assert sum(each.is_hole for each in outlines) == 1
     measured = measure_discs(rendered.photo, outlines, response=Response.UNKNOWN)
     discs = [each for each in measured if isinstance(each, Disc) and not each.outline.is_hole]
     ink = float(np.quantile(rendered.photo, 0.05)) / 255.0
-    assert [each.inside for each in discs] == pytest.approx([ink] * 9, abs=0.03)
+    assert [each.inside for each in discs] == pytest.approx([ink] * 4, abs=0.03)
     vectors = np.array([each.vector for each in discs])
     off = vectors - rendered.moments[nearest(vectors[:, :2], rendered.moments)]
     assert np.abs(off[:, :2]).max() < 0.03
@@ -233,8 +233,8 @@ def test_the_prior_keeps_the_gradient_over_a_small_disc_small(
     """On burnt ground, only the prior keeps the gradient from displacing the centre."""
     discs = tuple(
         SimulatedDisc((0.012 * i, 0.012 * j, 0.0), 0.006)
-        for j in range(-2, 3)
-        for i in range(-3, 4)
+        for j in range(-2, 2)
+        for i in range(-3, 3)
     )
     pose, rng = Pose(np.eye(3), np.array([0.0, 0.0, 0.6])), np.random.default_rng(4)
     photo = photograph(CAMERA, pose, FieldScene(discs, 1.5, 0.15), Optics(0.6), Sensor(), rng)
