@@ -141,7 +141,7 @@ CORRECT: dict[str, Callable[[], Flight]] = {
     "Raleigh, feet": partial(flight, "EPSG:2264", (2100000.0, 740000.0, 90.0)),
     "Tokyo": partial(flight, "EPSG:6677", (-7000.0, -35000.0, 70.0)),
     "Svalbard": partial(flight, "EPSG:25833", (515000.0, 8680000.0, 50.0)),
-    "Kiruna, web": partial(flight, "EPSG:3857", (2250000.0, 10450000.0, 430.0)),
+    "Kiruna": partial(flight, "EPSG:3006", (719000.0, 7537000.0, 430.0)),
 }
 
 
@@ -151,6 +151,18 @@ def test_correct_flights_raise_no_doubt(place: str, tmp_path: Path, *, has_refer
     one = CORRECT[place]()
     one = one if has_reference else without_reference(with_receiver(one))
     assert verdict(one, tmp_path / "flight") == Verdict(())
+
+
+@pytest.mark.parametrize("has_reference", [True, False])
+def test_a_map_that_is_not_to_scale_is_all_that_is_doubted(
+    tmp_path: Path, *, has_reference: bool
+) -> None:
+    """In Web Mercator, lengths in Kiruna are 2.6 times as long; vehicle and camera agree."""
+    one = flight("EPSG:3857", (2250000.0, 10450000.0, 430.0))
+    one = one if has_reference else without_reference(with_receiver(one))
+    (doubt,) = verdict(one, tmp_path / "flight").doubts
+    assert doubt.code is Cause.GRID_SCALE
+    assert doubt.figures["scale"] == pytest.approx(2.6, abs=0.1)
 
 
 @pytest.mark.parametrize(
