@@ -157,10 +157,15 @@ def process(
         call("-m", "kgcp", "detect", place, "--out", str(out), *workers, "--quiet")
     for command in () if only_detects else (("export-gcp", "--format", "all"), ("bias-report",)):
         call("-m", "kgcp", *command, place, "--out", str(out))
+    return file_hashes(out)
+
+
+def file_hashes(out: Path) -> dict[str, str]:
+    """Return the hashes of all files of a run, but of run.json, which says how long it took."""
     return {
         str(path.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(out.rglob("*"))
-        if path.is_file() and path.name != "run.json"  # which says how long it took
+        if path.is_file() and path.name != "run.json"
     }
 
 

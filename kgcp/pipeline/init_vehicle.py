@@ -26,6 +26,7 @@ _WORDS = {
     "csv": "CSV table",
     "tum": "TUM trajectory",
 }
+_GEOGRAPHIC = frozenset({"sbet", "rtklib", "waypoint"})  # formats that need no crs
 _WEEK_S = 2e6  # seconds of a week are less than this; Unix seconds are far larger
 _SHOWN_CRS = 3
 _SHOWN_FILES = 5
@@ -64,11 +65,7 @@ def _trajectory_parts(
     yield from layout_keys
     if start is None:
         yield Gap("trajectory", f"{name} cannot be read", "run kgcp check, which says why")
-    elif start.crs is not None and file.format not in {
-        "sbet",
-        "rtklib",
-        "waypoint",
-    }:  # these always have it
+    elif start.crs is not None and file.format not in _GEOGRAPHIC:
         yield DraftKey("crs", start.crs, "x, y are longitude and latitude")
     yield from _time_parts(file, start, times_s)
     if file.format == "sbet" and contents.accuracies:

@@ -169,10 +169,11 @@ def noise_sentence(placement: Placement) -> str:
     ]
     if not parts:
         return ""
+    advice = _ROUGH_POSES if noise.centre_px > _ROUGH_PX else ""
     return (
         "the images deviate by more than the stated standard deviations:"
         f" {' and '.join(parts)}; the standard deviations include this, but no error that all"
-        f" frames share{_ROUGH_POSES * (noise.centre_px > _ROUGH_PX)}"
+        f" frames share{advice}"
     )
 
 

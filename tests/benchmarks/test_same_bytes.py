@@ -6,7 +6,6 @@ whom.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import subprocess
 import sys
@@ -15,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.reliability.same_bytes import Circumstances, make_flight, process
+from benchmarks.reliability.same_bytes import Circumstances, file_hashes, make_flight, process
 
 # in one process, which imports once; by default, more frames would be exposed again
 _EXPORT_AND_REPORT = """\
@@ -60,11 +59,7 @@ def reported(flight: Path, out: Path, circumstances: Circumstances) -> dict[str,
         capture_output=True,
         check=True,
     )
-    return {
-        str(path.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(out.rglob("*"))
-        if path.is_file() and path.name != "run.json"
-    }
+    return file_hashes(out)
 
 
 def test_threads_and_jobs_change_no_byte(flight: Path, tmp_path: Path) -> None:

@@ -98,10 +98,10 @@ def test_images_that_are_not_read_are_named_once(flight: Path) -> None:
     first = next(frames.iterdir())
     (frames / f"{first.stem}.DNG").write_bytes(b"raw")
     result = run("detect", str(flight), "--jobs", "0", "--quiet")
-    assert "left out" not in result.stderr
+    assert "leaves out" not in result.stderr
     (frames / "IMG_0001.HEIC").write_bytes(b"heic")
     result = run("detect", str(flight), "--jobs", "0", "--quiet")
-    assert result.stderr.count("1 .heic files of a phone are left out, because") == 1
+    assert result.stderr.count("does not read .heic files of a phone and leaves out 1; ") == 1
 
 
 @pytest.mark.parametrize("command", ["export-gcp", "bias-report"])

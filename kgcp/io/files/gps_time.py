@@ -38,11 +38,12 @@ class TimeSystem(StrEnum):
     UTC = "utc"
 
 
-def _clock_s(day: date) -> float:
+def midnight_s(day: date) -> float:
+    """Return the clock time at which a day begins [s]."""
     return datetime(day.year, day.month, day.day, tzinfo=UTC).timestamp()
 
 
-_LEAPS_UTC_S: FloatArray = np.array([_clock_s(date.fromisoformat(day)) for day in _LEAPS])
+_LEAPS_UTC_S: FloatArray = np.array([midnight_s(date.fromisoformat(day)) for day in _LEAPS])
 _LEAPS_GPS_S: FloatArray = _LEAPS_UTC_S + np.arange(1, len(_LEAPS) + 1)
 
 
@@ -54,7 +55,7 @@ def unix_from_gps(clock_s: FloatArray) -> FloatArray:
     """
     clock_s = np.asarray(clock_s, dtype=np.float64)
     unix_s: FloatArray = clock_s - np.searchsorted(_LEAPS_GPS_S, clock_s, side="right")
-    if unix_s.size and unix_s.max() >= _clock_s(LEAPS_KNOWN_UNTIL):
+    if unix_s.size and unix_s.max() >= midnight_s(LEAPS_KNOWN_UNTIL):
         warnings.warn(
             f"GPS time is taken as {len(_LEAPS)} s ahead of UTC, which is known until"
             f" {LEAPS_KNOWN_UNTIL} only; use a newer version of kgcp if there was a leap second",
@@ -89,7 +90,7 @@ def clock_from_date(first_day: date, seconds: FloatArray) -> FloatArray | None:
     """
     seconds = unwrap_week(np.asarray(seconds, dtype=np.float64))
     within = seconds[0] % WEEK_S
-    midnight = _clock_s(first_day)
+    midnight = midnight_s(first_day)
     since_midnight = within - (midnight - _GPS_START_S) % WEEK_S
     if not 0.0 <= since_midnight < _DAY_S:
         return None

@@ -80,18 +80,23 @@ def read_solution(file: ForeignFile) -> RtklibSolution:
 
 
 def _columns(names: Sequence[tuple[str, str]], cells: FloatArray) -> dict[str, FloatArray]:
-    """Return cells (n, width) by name; sexagesimal angles have their sign at the degrees."""
+    """Return cells (n, width) by name."""
     columns, first = {}, 0
     for name, unit in names:
         if unit == _SEXAGESIMAL:
-            degrees, minutes, seconds = cells[:, first : first + 3].T
-            angle = np.abs(degrees) + minutes / 60.0 + seconds / 3600.0
-            columns[name] = np.copysign(angle, degrees)
+            columns[name] = sexagesimal_deg(cells[:, first : first + 3])
             first += 3
         else:
             columns[name] = cells[:, first]
             first += 1
     return columns
+
+
+def sexagesimal_deg(parts: FloatArray) -> FloatArray:
+    """Return angles (n,) of degrees, minutes and seconds (n, 3); the sign stands at the degrees."""
+    degrees, minutes, seconds = parts.T
+    size = np.abs(degrees) + minutes / 60.0 + seconds / 3600.0
+    return np.asarray(np.copysign(size, degrees))
 
 
 def _clocks_and_cells(

@@ -8,9 +8,9 @@ OM-20000166, "Export Wizard" and "Output Variables".)
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice, takewhile
 
@@ -20,6 +20,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.files.safe_read import LARGEST
 from kgcp.io.files.sniff import ForeignFile
+from kgcp.io.formats.rtklib_pos import sexagesimal_deg
 
 _PROGRAM = re.compile(r"^\s*Program:.*\b(?:Inertial Explorer|GrafNav)\b", re.MULTILINE)
 _UNIT = re.compile(r"\([^()]*\)")
@@ -65,11 +66,13 @@ class WaypointExport:
             raise self.file.error(
                 f"gives {name} in {column.unit or 'no unit'}", f"export it in {unit}"
             )
-        parse = _degrees if is_sexagesimal else float
         try:
-            values = np.array(list(map(parse, column.texts)), dtype=np.float64)
+            values = _parsed(column.texts, is_sexagesimal=is_sexagesimal)
         except ValueError:
-            values = np.array([_parsed(parse, text) for text in column.texts])
+            values = np.full(len(column.texts), np.nan)
+            for row, text in enumerate(column.texts):
+                with suppress(ValueError):
+                    values[row] = _parsed([text], is_sexagesimal=is_sexagesimal)[0]
         wrong = np.flatnonzero(~(np.abs(values) < LARGEST))
         if wrong.size:
             text = column.texts[wrong[0]]
@@ -94,8 +97,8 @@ def read_export(file: ForeignFile) -> WaypointExport:
     Raises
     ------
     KgcpError
-        If it lacks the lines of names and units, a unit belongs to no column, or an epoch has
-        another number of cells.
+        If it lacks the lines of names and units, a column has two units, or an epoch has another
+        number of cells.
     """
     rows = file.text.splitlines()
     below = next((i for i, row in enumerate(rows) if i and _UNITS.fullmatch(row)), None)
@@ -115,7 +118,9 @@ def read_export(file: ForeignFile) -> WaypointExport:
     ]
     for number, row in enumerate(rows[first + len(epochs) :], start=first + len(epochs) + 1):
         if epochs and _EPOCH.match(row) and len(row.split()) == len(epochs[-1].split()):
-            raise file.error_at(f"line {number}", "is an epoch below lines that are none", _AGAIN)
+            raise file.error_at(
+                f"line {number}", "is an epoch that follows lines that are not", _AGAIN
+            )
     columns: dict[str, WaypointColumn] = {}
     by_column = zip(*cells, strict=True) if cells else ((),) * len(units)
     for (name, unit), texts in zip(units, by_column, strict=True):
@@ -168,7 +173,9 @@ def _cells(
         words = iter(texts)
         texts = [" ".join(islice(words, width)) for width in widths]
     if len(texts) != len(widths):
-        raise file.error_at(f"line {line}", "has not one cell for each column", "repair the line")
+        raise file.error_at(
+            f"line {line}", "does not have one cell for each column", "repair the line"
+        )
     return texts
 
 
@@ -179,16 +186,8 @@ def _scales(rows: Sequence[str]) -> dict[str, str]:
     return {match[1].capitalize(): match[2] for match in found if match}
 
 
-def _parsed(parse: Callable[[str], float], text: str) -> float:
-    """Return a number; NaN if it is none."""
-    try:
-        return parse(text)
-    except ValueError:
-        return math.nan
-
-
-def _degrees(text: str) -> float:
-    """Return an angle of degrees, minutes and seconds; the sign stands at the degrees."""
-    degrees, minutes, seconds = text.split()
-    size = abs(float(degrees)) + float(minutes) / 60.0 + float(seconds) / 3600.0
-    return float(np.copysign(size, float(degrees)))
+def _parsed(texts: Sequence[str], *, is_sexagesimal: bool) -> FloatArray:
+    """Return numbers, or angles of degrees, minutes and seconds [deg]."""
+    if is_sexagesimal:
+        return sexagesimal_deg(np.array([[*map(float, text.split())] for text in texts]))
+    return np.array([*map(float, texts)])

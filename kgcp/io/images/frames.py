@@ -150,8 +150,7 @@ def _warn_of_left_out(names: Sequence[str], frames: Sequence[str], folder: str) 
     for suffix, count in sorted(left_out.items()):
         kind, conversion = kind_of(suffix)
         warnings.warn(
-            f"{folder}: {count} {suffix} {kind} are left out, because kgcp does not read them;"
-            f" {conversion}",
+            f"{folder}: kgcp does not read {suffix} {kind} and leaves out {count}; {conversion}",
             KgcpWarning,
             stacklevel=3,
         )

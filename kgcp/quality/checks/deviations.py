@@ -39,7 +39,9 @@ def check_deviations(motion: Motion) -> Iterator[Doubt]:
     sd_m = motion.sd_position_m
     if sd_m is None:
         yield _missing("positions", "points will have none")
-    else:
+    elif motion.sd_attitude_deg is None:
+        yield _missing("attitudes", "the lever arm's direction counts as exact")
+    if sd_m is not None:
         effect = "points there are weighted far too much"
         is_zero = np.any(sd_m == 0.0, axis=1)
         yield from _zeros(is_zero, "trajectory's positions", "epochs", effect, _REMEDY)
@@ -50,9 +52,7 @@ def check_deviations(motion: Motion) -> Iterator[Doubt]:
             yield _in_another_unit(usual_m.max(), "which suggests millimetres")
         elif usual_m.min() > 0.0:
             yield from _scatter(motion, float(np.linalg.norm(usual_m)))
-    if motion.sd_attitude_deg is None and sd_m is not None:
-        yield _missing("attitudes", "the lever arm's direction counts as exact")
-    elif motion.sd_attitude_deg is not None:
+    if motion.sd_attitude_deg is not None:
         effect = "the lever arm's direction counts as exact"
         # of all three angles: level ground may be known better than can be written
         is_zero = np.all(motion.sd_attitude_deg == 0.0, axis=1)

@@ -110,7 +110,7 @@ class Cause(StrEnum):
     )
     STATIC_TARGETS = (
         "static_targets",
-        "a static target is not at its position_m, as poses or others show, or is not found there",
+        "a static target is not at its position_m, as poses or other targets show, or is not found",
     )
     CAMERA_POSITION = (
         "camera_position",

@@ -68,7 +68,7 @@ class Epochs:
     sd_attitude_deg: FloatArray | None = None  # (n, 3): of roll, pitch, heading [deg]
 
 
-def true_covariances(written: FloatArray) -> FloatArray:
+def valid_covariances(written: FloatArray) -> FloatArray:
     """Return covariances (n, 3, 3) as a file has them, with negative eigenvalues set to 0.
 
     The rounding of its numbers can make a matrix that is not a covariance.

@@ -17,7 +17,7 @@ from kgcp.io.formats.trajectories.records import (
     Epochs,
     TrajectoryFileOptions,
     check_times,
-    true_covariances,
+    valid_covariances,
 )
 
 GEOCENTRIC = "EPSG:4978"
@@ -81,4 +81,4 @@ def _covariances(deviations: FloatArray, roots: FloatArray) -> FloatArray:
     cov[:, range(3), range(3)] = deviations**2
     for (row, column), root in zip(((0, 1), (1, 2), (2, 0)), roots.T, strict=True):
         cov[:, row, column] = cov[:, column, row] = np.copysign(root**2, root)
-    return true_covariances(cov)
+    return valid_covariances(cov)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, date, datetime
+from datetime import date
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from kgcp.io.files.gps_time import (
     TimeSystem,
     clock_from_date,
     clock_from_week,
+    midnight_s,
     unix_from_clock,
     unwrap_week,
 )
@@ -28,7 +29,7 @@ from kgcp.io.formats.trajectories.records import (
     Epochs,
     TrajectoryFileOptions,
     check_times,
-    true_covariances,
+    valid_covariances,
 )
 from kgcp.io.formats.trajectories.times import times_from_week
 from kgcp.io.formats.waypoint_export import WaypointExport, read_export
@@ -151,13 +152,8 @@ def time_columns(export: WaypointExport) -> TimeColumns:
 def _dates_s(export: WaypointExport, days: str) -> FloatArray:
     """Return the beginnings of days (n,) as clock times [s]."""
     texts = export.columns[days].texts
-    of_text = {
-        text: datetime.combine(
-            _date(export, days, texts.index(text)), datetime.min.time(), UTC
-        ).timestamp()
-        for text in dict.fromkeys(texts)
-    }
-    return np.array([of_text[text] for text in texts])
+    _, rows, day = np.unique(texts, return_index=True, return_inverse=True)
+    return np.array([midnight_s(_date(export, days, row)) for row in rows.tolist()])[day]
 
 
 def _date(export: WaypointExport, days: str, row: int) -> date:
@@ -191,7 +187,7 @@ def _check_datum(export: WaypointExport) -> None:
     datum, source = export.header.get("Datum", "unknown"), export.header.get("Source", "")
     if "PPP" in source:
         raise export.file.error(
-            "holds a precise point positioning, whose coordinates are in ITRF",
+            "was computed by precise point positioning, so that its coordinates are in ITRF",
             'name its CRS under [vehicle] in flight.toml: crs = "EPSG:9989" is ITRF2020',
         )
     if not re.match(r"WGS[ -]?84\b(?!\s*\()", datum):
@@ -207,7 +203,7 @@ def _position_precision(export: WaypointExport) -> tuple[FloatArray | None, Floa
     if cells <= export.columns.keys():
         _check_scale(export, "Position")
         written = np.stack([_block(export, row, "m^2") for row in _COV_PLACE], axis=1)
-        cov = true_covariances(written)
+        cov = valid_covariances(written)
         return cov, np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
     if not set(_SD_PLACE) <= export.columns.keys():
         return None, None

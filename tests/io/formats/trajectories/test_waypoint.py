@@ -144,14 +144,14 @@ def test_seconds_of_the_week_alone_need_the_day(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("Smoothed TC Combined", "PPP Combined", "precise point positioning"),
+        ("Smoothed TC Combined", "PPP Combined", "was computed by precise point positioning"),
         ("WGS84, (processing datum)", "NAD83 (2011)", r"the datum as NAD83 \(2011\)"),
         ("WGS84, (processing datum)", "WGS84 (2025.690)", "the datum as WGS84"),
         ("Position: 1.0000", "Position: 2.0000", r"scaled its standard deviations \(Position: 2"),
         ("No scaling (1-sigma)", "2-sigma", r"scaled its standard deviations \(Attitude"),
         (" H-Ell", " H-MSL", "lacks H-Ell"),
         ("48.1508940409", "48.15089404O9", "line 17: Latitude '48.15089404O9' is not a number"),
-        ("  0.4095", "", "line 17: has not one cell for each column"),
+        ("  0.4095", "", "line 17: does not have one cell for each column"),
         ("(weeks)", "       ", "gives Week in no unit"),
         ("0.0210  0.0500", "-0.021  0.0500", "line 16: a standard deviation is negative"),
         ("    (sec)", "(min sec)", "gives GPSTime in min sec; export it in sec"),
@@ -198,7 +198,7 @@ def test_keys_that_contradict_the_file_are_refused(tmp_path: Path) -> None:
 def test_a_table_that_goes_on_below_words_is_refused(tmp_path: Path) -> None:
     rows = TABLE.splitlines()
     broken = "\n".join([*rows[:3], "Gap of 2 s", rows[3]])
-    with pytest.raises(KgcpError, match="line 18: is an epoch below lines that are none"):
+    with pytest.raises(KgcpError, match="line 18: is an epoch that follows lines that are not"):
         read(written(tmp_path, broken))
     with pytest.raises(KgcpError, match="lacks the lines with the names"):
         read(written(tmp_path, "\n".join(rows[2:])))
