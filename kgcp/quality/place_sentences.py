@@ -21,7 +21,9 @@ _ROUGH_PX = 5.0  # noise of places from which on poses are rough
 _ROUGH_POSES = (
     "; targets seem too far away if poses are rougher than stated: state all errors of the poses"
 )
-_MIN_NOISE_PX = 0.005  # of additional noise that is reported
+# Additional noise is reported if it is at least this large, and so improbable by chance. Half of
+# all right flights have some.
+_MIN_NOISE_PX, _MAX_CHANCE = 0.005, 1e-3
 
 
 def has_other_diameter(placed: PlacedTarget) -> bool:
@@ -161,11 +163,15 @@ def noise_sentence(placement: Placement) -> str:
     noise = placement.noise
     parts = [
         f"{value:.3f} px in {what}"
-        for value, what in (
-            (noise.centre_px, "the places (by the reference poses or the calibration)"),
-            (noise.outline_px, "size and shape"),
+        for value, chance, what in (
+            (
+                noise.centre_px,
+                noise.centre_chance,
+                "the places (by the reference poses or the calibration)",
+            ),
+            (noise.outline_px, noise.outline_chance, "size and shape"),
         )
-        if value > _MIN_NOISE_PX
+        if value > _MIN_NOISE_PX and chance < _MAX_CHANCE
     ]
     if not parts:
         return ""

@@ -237,6 +237,38 @@ def test_drifting_poses_are_not_taken_for_a_moved_circle() -> None:
     assert noise.centre_px > 0.03
 
 
+def with_pose_errors(rng: np.random.Generator, factor: float) -> list[CircleViews]:
+    """Three circles in twelve frames, whose poses are `factor` times less accurate than stated."""
+    sds = np.repeat([0.05, 0.003], 3)  # m, rad
+    exact, steps = views_of(circle_of(10.0), rng, frames=12), sds * rng.standard_normal((12, 6))
+    turns = np.array([rotation_about(factor * step[3:]) for step in steps])
+    many = []
+    for place in ([0.3, -0.2, 0.1], [1.2, 0.4, 0.0], [-0.9, 0.5, 0.2]):
+        circle = replace(circle_of(10.0), centre_m=np.array(place))
+        moments = circle_images(CAMERA, circle.in_cameras(exact)).moments
+        noise = np.linalg.cholesky(exact.cov) @ rng.standard_normal((12, 5, 1))
+        many.append(
+            CircleViews(
+                exact.camera_m + factor * steps[:, :3],
+                turns @ exact.world_from_camera,
+                moments + noise[..., 0],
+                exact.cov,
+                np.broadcast_to(np.diag(sds**2), (12, 6, 6)),
+            )
+        )
+    return many
+
+
+def test_errors_that_circles_of_a_frame_share_are_not_taken_for_excessive_noise() -> None:
+    rng = np.random.default_rng(16)
+    _, noise = place_circles(CAMERA, with_pose_errors(rng, 1.0))
+    assert noise.centre_px > 10.0
+    assert noise.centre_chance > 1e-3
+    assert noise.outline_chance > 1e-3
+    _, noise = place_circles(CAMERA, with_pose_errors(rng, 3.0))
+    assert noise.centre_chance < 1e-6
+
+
 def test_a_bad_outline_among_good_ones_has_its_own_larger_deviations() -> None:
     """Its centres are as good as the others', but its shapes are forty times worse than stated."""
     rng, truth = np.random.default_rng(7), circle_of(10.0)

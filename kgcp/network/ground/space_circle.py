@@ -104,6 +104,9 @@ class ExtraNoise:
     # smaller than stated
     centre_factor: float = 1.0
     outline_factor: float = 1.0
+    # probability that residuals of places and shapes are so large by chance, with the stated noise
+    centre_chance: float = 1.0
+    outline_chance: float = 1.0
 
 
 class NoCircleError(Exception):

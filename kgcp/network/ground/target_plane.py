@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import optimize
+from scipy import optimize, special
 from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
@@ -202,7 +202,7 @@ def extra_noise(camera: Camera, placed: Sequence[tuple[CircleViews, CircleFit]])
     of freedom. If χ² is smaller with the stated covariances alone, and there are enough images,
     these are scaled down instead.
     """
-    sds_px, factors = [], []
+    sds_px, factors, chances = [], [], []
     for part, unknowns in ((slice(0, 2), 3), (slice(2, 5), 3)):
         residuals, stated, unit, freedom = [], [], [], 0
         for views, fit in placed:
@@ -212,14 +212,46 @@ def extra_noise(camera: Camera, placed: Sequence[tuple[CircleViews, CircleFit]])
             stated.append(covs[:, part, part])
             unit.append(outline_noise(kept.moments)[:, part, part])
             freedom += residuals[-1].size - unknowns
-        sd, factor = _excess(
+        sd, factor, ratio = _excess(
             np.concatenate(residuals), np.concatenate(stated), np.concatenate(unit), freedom
         )
         # small residuals do not prove exact poses: they hide pose errors that all frames share
         is_of_poses = part.start == 0 and any(views.exterior_cov is not None for views, _ in placed)
+        independent = freedom * _independent_share(camera, placed, part)
         sds_px.append(sd)
         factors.append(1.0 if is_of_poses else factor)
-    return ExtraNoise(*sds_px, *factors)
+        chances.append(float(special.chdtrc(independent, ratio * independent)))
+    return ExtraNoise(*sds_px, *factors, *chances)
+
+
+def _independent_share(
+    camera: Camera, placed: Sequence[tuple[CircleViews, CircleFit]], part: slice
+) -> float:
+    """Return how many independent numbers have a χ² that scatters alike, as a share of all numbers.
+
+    Circles in the same frame share the error of its orientation. If C are the covariances of single
+    images, and F is the true one of all of them, χ² has the variance 2 tr(C⁻¹ F C⁻¹ F).
+
+    Parameters
+    ----------
+    part : slice
+        The moments that count.
+    """
+    numbers, squares = 0, 0.0
+    of_frames: dict[tuple[float, ...], FloatArray] = {}
+    for views, fit in placed:
+        kept = views.chosen(fit.is_used)
+        numbers += kept.moments[:, part].size
+        if kept.exterior_cov is None:
+            continue
+        by_exterior = _moments_by_exterior(camera, kept, fit.circle)[:, part]
+        weighted = np.linalg.solve(_stated(camera, kept, fit.circle)[:, part, part], by_exterior)
+        shares = np.swapaxes(by_exterior, 1, 2) @ weighted @ np.nan_to_num(kept.exterior_cov)
+        squares -= float(np.einsum("npq,nqp->", shares, shares))
+        for place, share in zip(kept.camera_m.tolist(), shares, strict=True):
+            of_frames[tuple(place)] = of_frames.get(tuple(place), np.zeros((6, 6))) + share
+    squares += sum(float(np.sum(share * share.T)) for share in of_frames.values())
+    return numbers / (numbers + squares) if numbers else 1.0
 
 
 def common_covariance(
@@ -521,8 +553,8 @@ def _moments_by_exterior(camera: Camera, views: CircleViews, circle: SpaceCircle
 
 def _excess(
     residuals: FloatArray, stated: FloatArray, unit: FloatArray, freedom: int
-) -> tuple[float, float]:
-    """Return σ ≥ 0 and a factor ≤ 1 with which χ² equals `freedom`.
+) -> tuple[float, float, float]:
+    """Return σ ≥ 0 and a factor ≤ 1 with which χ² equals `freedom`, and χ² / `freedom` without.
 
     Covariances are `stated` + σ² `unit`, or the factor times `stated`.
     """
@@ -532,14 +564,14 @@ def _excess(
         return float(np.sum(residuals * solved))
 
     if freedom <= 0:
-        return 0.0, 1.0
+        return 0.0, 1.0, 1.0
     ratio = squares(0.0) / freedom
     if ratio <= 1.0:
-        return 0.0, max(ratio, _MIN_FACTOR) if freedom >= _MIN_FREEDOM else 1.0
+        return 0.0, max(ratio, _MIN_FACTOR) if freedom >= _MIN_FREEDOM else 1.0, ratio
     if squares(MAX_EXTRA_PX) > freedom:
-        return MAX_EXTRA_PX, 1.0
+        return MAX_EXTRA_PX, 1.0, ratio
     sd = optimize.brentq(lambda sd: squares(sd) - freedom, 0.0, MAX_EXTRA_PX, xtol=1e-12)
-    return float(sd), 1.0
+    return float(sd), 1.0, ratio
 
 
 def _is_same(first: SpaceCircle, second: SpaceCircle) -> bool:
