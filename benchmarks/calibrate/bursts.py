@@ -14,7 +14,7 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import rotation_about
-from kgcp.network.equations import computed, view_rows
+from kgcp.network.equations import computed, network_rows, view_rows
 from kgcp.network.frame_camera import FrameCameraModel
 from kgcp.network.records import CalibrationPrior, Estimate, Network, Observations, PointPrior
 
@@ -120,7 +120,7 @@ def _scores(network: Network, estimate: Estimate, waves: tuple[FloatArray, ...])
     places = computed(network, estimate)
     displaced = np.cos(places @ vectors.T + phases) @ amplitudes
     scores = []
-    for view in view_rows(network, estimate, np.ones(len(places))):
+    for view in view_rows(network, network_rows(network, estimate, np.ones(len(places)))):
         basis = np.linalg.qr(view.by_pose)[0]
         own = view.by_camera - basis @ (basis.T @ view.by_camera)
         scores.append(own.T @ displaced[view.rows].ravel() / np.linalg.norm(own, axis=0))

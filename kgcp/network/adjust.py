@@ -10,16 +10,16 @@ from scipy import linalg
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.network.equations import (
+    NetworkRows,
     ReducedSystem,
-    ViewRows,
     bordered_by,
     computed,
     inner_constraints,
     moved,
+    network_rows,
     prior_cost,
     reduce_poses,
     scales_of,
-    view_rows,
     whitened,
 )
 from kgcp.network.point_elimination import (
@@ -113,9 +113,9 @@ def _minimise(
     damping = _FIRST_DAMPING
     cost = _cost(network, estimate, weights)
     for _ in range(max_steps):
-        equations = view_rows(network, estimate, weights)
+        rows = network_rows(network, estimate, weights)
         while True:
-            trial = _stepped(network, estimate, equations, damping)
+            trial = _stepped(network, estimate, rows, damping)
             trial_cost = _cost(network, trial, weights)
             if trial_cost <= cost or damping > _MAX_DAMPING:
                 break
@@ -130,13 +130,11 @@ def _minimise(
     return estimate
 
 
-def _stepped(
-    network: Network, estimate: Estimate, equations: list[ViewRows], damping: float
-) -> Estimate:
+def _stepped(network: Network, estimate: Estimate, rows: NetworkRows, damping: float) -> Estimate:
     if can_eliminate_points(network):
-        reduced = reduce_points(network, estimate, equations, damping)
+        reduced = reduce_points(network, estimate, rows, damping)
         return moved_by_points(network, estimate, reduced)
-    system = reduce_poses(network, estimate, equations, damping)
+    system = reduce_poses(network, estimate, rows, damping)
     return moved(network, estimate, system, _solved(network, estimate, system))
 
 
@@ -175,19 +173,17 @@ def _reweighted(
     sizes = np.linalg.norm(whitened(network, residuals, np.ones(len(residuals))), axis=1)
     # Some photographs fit worse than others as a whole. A disc is an outlier only relative to its
     # own photograph.
+    order = np.lexsort((sizes, observations.view))
+    views, in_order = observations.view[order], sizes[order]
+    starts = np.searchsorted(views, np.arange(len(network.view_camera) + 1))
+    counts, starts = np.diff(starts), starts[:-1]
+    medians = 0.5 * (in_order[starts + (counts - 1) // 2] + in_order[starts + counts // 2])
     overall = max(float(np.median(sizes)) / _MEDIAN_NORM, _MIN_DEVIATION)
-    of_views = [
-        float(np.median(sizes[observations.view == view])) / _MEDIAN_NORM
-        for view in range(len(network.view_camera))
-    ]
-    deviation = np.clip(of_views, overall, _MAX_PHOTOGRAPH_DEVIATION * overall)[observations.view]
-    limit = robustness.rejection * deviation
-    is_used = sizes <= limit
-    for view in range(len(network.view_camera)):
-        in_view = np.flatnonzero(observations.view == view)
-        count = max(_MIN_DISCS, math.ceil(_MIN_SHARE * len(in_view)))
-        best = in_view[np.argsort(sizes[in_view], kind="stable")[:count]]
-        is_used[best] = True
+    of_views = np.clip(medians / _MEDIAN_NORM, overall, _MAX_PHOTOGRAPH_DEVIATION * overall)
+    deviation = of_views[observations.view]
+    is_used = sizes <= robustness.rejection * deviation
+    rank = np.arange(len(sizes)) - starts[views]
+    is_used[order[rank < np.maximum(_MIN_DISCS, np.ceil(_MIN_SHARE * counts))[views]]] = True
     weights = is_used.astype(np.float64)
     if robustness.is_huber:
         huber = _HUBER * deviation * math.sqrt(2.0)

@@ -41,6 +41,7 @@ from kgcp.network.equations import (
     ViewRows,
     bordered_by,
     inner_constraints,
+    network_rows,
     prior_cost,
     prior_equations,
     reduce_poses,
@@ -72,9 +73,9 @@ def precision(network: Network, solution: Solution) -> Precision:
     numpy.linalg.LinAlgError
         If an unknown is not determined at all.
     """
-    equations = view_rows(network, solution.estimate, solution.weights)
-    system = reduce_poses(network, solution.estimate, equations)
-    inverse = _inverse(network, system)
+    rows = network_rows(network, solution.estimate, solution.weights)
+    system = reduce_poses(network, solution.estimate, rows)
+    inverse, equations = _inverse(network, system), view_rows(network, rows)
     squares = float(np.sum(whitened(network, solution.residuals, solution.weights) ** 2))
     squares += prior_cost(network, solution.estimate)
     factor = squares / max(_degrees_of_freedom(network, solution.weights, len(inverse)), 1)
@@ -118,11 +119,11 @@ def fitting_covariances(network: Network, solution: Solution, stated: FloatArray
 
 def bend_cofactors(network: Network, solution: Solution) -> FloatArray:
     """Return the cofactors (v, b) of the bends, with all other unknowns estimated as well."""
-    equations = view_rows(network, solution.estimate, solution.weights)
+    rows = network_rows(network, solution.estimate, solution.weights)
     if can_eliminate_points(network):
-        reduced = reduce_points(network, solution.estimate, equations)
+        reduced = reduce_points(network, solution.estimate, rows)
         return bend_cofactors_of(network, reduced)
-    system = reduce_poses(network, solution.estimate, equations)
+    system = reduce_poses(network, solution.estimate, rows)
     return _bend_cofactors(system, _inverse(network, system))
 
 
@@ -145,10 +146,10 @@ def _unknown_count(network: Network) -> int:
 
 def _determined_by_priors(network: Network, solution: Solution) -> float:
     """Return how many unknowns priors and inner constraints determine, as a sum of shares."""
-    equations = view_rows(network, solution.estimate, solution.weights)
+    rows = network_rows(network, solution.estimate, solution.weights)
     if can_eliminate_points(network):
-        return determined_by_priors(network, reduce_points(network, solution.estimate, equations))
-    system = reduce_poses(network, solution.estimate, equations)
+        return determined_by_priors(network, reduce_points(network, solution.estimate, rows))
+    system = reduce_poses(network, solution.estimate, rows)
     inverse = _inverse(network, system)
     information, _ = prior_equations(network, solution.estimate, len(inverse))
     by_bends = 0.0
@@ -186,14 +187,10 @@ def _inverse(network: Network, system: ReducedSystem) -> FloatArray:
 
 def _pose_inverses(system: ReducedSystem, inverse: FloatArray) -> FloatArray:
     """Return the cofactors (v, q, q) of poses and bends, with cameras and points estimated."""
-    cofactors = []
-    for normal, coupling, columns in zip(
-        system.pose_normals, system.couplings, system.columns, strict=True
-    ):
-        own = np.linalg.inv(normal)
-        back = own @ coupling.T
-        cofactors.append(own + back @ inverse[np.ix_(columns, columns)] @ back.T)
-    return np.array(cofactors)
+    own = np.linalg.inv(system.pose_normals)
+    back = own @ system.couplings.transpose(0, 2, 1)
+    carried = (back.reshape(-1, len(inverse)) @ inverse).reshape(back.shape)
+    return np.asarray(own + carried @ back.transpose(0, 2, 1))
 
 
 def _bend_cofactors(system: ReducedSystem, inverse: FloatArray) -> FloatArray:

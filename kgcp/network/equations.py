@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -32,16 +33,6 @@ class ViewRows:
     bend_rows: FloatArray  # (b, q): derivatives by pose and bends
     bend_residuals: FloatArray  # (b,)
 
-    @property
-    def pose_normal(self) -> FloatArray:
-        """The normal matrix (q, q) of pose and bends."""
-        return np.asarray(self.by_pose.T @ self.by_pose + self.bend_rows.T @ self.bend_rows)
-
-    @property
-    def pose_right(self) -> FloatArray:
-        """The right side (q,) of pose and bends."""
-        return np.asarray(self.by_pose.T @ self.residuals + self.bend_rows.T @ self.bend_residuals)
-
     def dense(self) -> FloatArray:
         """Return the derivatives (2m, k) by the reduced unknowns."""
         if self.by_point is None:
@@ -54,15 +45,85 @@ class ViewRows:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class NetworkRows:
+    """Whitened observation equations of all v photographs, one photograph after the other.
+
+    There are n discs, each with two rows as in `ViewRows`.
+    """
+
+    rows: IndexArray  # (n,): indices of the observations
+    starts: IndexArray  # (v + 1,): the discs of photograph i are starts[i] to starts[i + 1] - 1
+    points: IndexArray  # (n,): indices of the points
+    design: FloatArray  # (2n, p + q): derivatives by the camera, then by the pose and the bends
+    by_point: FloatArray | None  # (n, 2, 3); None: points are fixed
+    residuals: FloatArray  # (2n,)
+    bend_rows: FloatArray  # (b, q), as in `ViewRows`
+    bend_residuals: FloatArray  # (v, b)
+
+    @property
+    def parameters(self) -> int:
+        """Number p of the parameters of a camera."""
+        return int(self.design.shape[1] - self.bend_rows.shape[1])
+
+    @property
+    def views(self) -> IndexArray:
+        """Index of each disc's photograph (n,)."""
+        return np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
+
+    def normals(self) -> tuple[FloatArray, FloatArray]:
+        """Return each photograph's normal matrix (v, p + q, p + q) and right side (v, p + q).
+
+        The unknowns are those of `design`; the prior of the bends is included.
+        """
+        count, unknowns = len(self.starts) - 1, self.design.shape[1]
+        normals, rights = np.empty((count, unknowns, unknowns)), np.empty((count, unknowns))
+        bounds = (2 * self.starts).tolist()
+        for index, (first, last) in enumerate(pairwise(bounds)):
+            design = self.design[first:last]
+            normals[index] = design.T @ design
+            rights[index] = design.T @ self.residuals[first:last]
+        pose = self.parameters
+        normals[:, pose:, pose:] += self.bend_rows.T @ self.bend_rows
+        rights[:, pose:] += self.bend_residuals @ self.bend_rows
+        return normals, rights
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointNormals:
+    """Parts of the normal equations that belong to the points, from the observations alone."""
+
+    squares: FloatArray  # (m, 3, 3): of each point
+    right: FloatArray  # (m, 3)
+    by_camera: FloatArray  # (c, m, 3, p): of each point and camera
+    by_pose: FloatArray  # (n, 3, q): of each disc's point, and the pose of its photograph
+
+    @classmethod
+    def of(cls, network: Network, rows: NetworkRows, by_point: FloatArray) -> PointNormals:
+        """Compute them; `by_point` (n, 2, 3) is that of the rows."""
+        count, cameras = len(network.points.nominal), len(network.cameras.values)
+        across = np.swapaxes(by_point, 1, 2)
+        by_design = across @ rows.design.reshape(len(by_point), 2, -1)
+        camera_of = network.view_camera[rows.views]
+        by_camera = _sums(
+            by_design[:, :, : rows.parameters], camera_of * count + rows.points, cameras * count
+        )
+        return cls(
+            _sums(across @ by_point, rows.points, count),
+            _sums((across @ rows.residuals.reshape(-1, 2, 1))[:, :, 0], rows.points, count),
+            by_camera.reshape(cameras, count, 3, -1),
+            by_design[:, :, rows.parameters :],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ReducedSystem:
     """Normal equations with the poses eliminated, and the terms to compute the poses from them."""
 
-    normal: FloatArray  # (u, u)
+    normal: FloatArray  # (u, u): cameras, then points unless they are fixed
     right: FloatArray  # (u,)
     pose_normals: FloatArray  # (v, q, q): poses, then bends
     pose_rights: FloatArray  # (v, q)
-    couplings: tuple[FloatArray, ...]  # per photograph (k, q)
-    columns: tuple[IndexArray, ...]  # per photograph (k,)
+    couplings: FloatArray  # (v, u, q)
 
 
 def computed(network: Network, estimate: Estimate) -> FloatArray:
@@ -70,6 +131,8 @@ def computed(network: Network, estimate: Estimate) -> FloatArray:
     observed = network.observations
     rays = _camera_points(network, estimate)
     normalised = rays[:, :2] / rays[:, 2:]
+    if len(estimate.cameras) == 1:
+        return network.model.places(estimate.cameras[0], normalised)
     places = np.empty_like(observed.places)
     cameras = network.view_camera[observed.view]
     for camera in range(len(estimate.cameras)):
@@ -106,51 +169,74 @@ def whitened(network: Network, residuals: FloatArray, weights: FloatArray) -> Fl
     return np.asarray(scaled * np.sqrt(weights)[:, None])
 
 
-def view_rows(network: Network, estimate: Estimate, weights: FloatArray) -> list[ViewRows]:
-    """Return the whitened equations of every photograph, linearised at an estimate.
+def network_rows(network: Network, estimate: Estimate, weights: FloatArray) -> NetworkRows:
+    """Return the whitened equations of a network, linearised at an estimate.
 
     A pose changes as in `Pose.moved`: translation, and a left rotation vector in the camera frame.
     """
     observed, used = network.observations, np.flatnonzero(weights > 0.0)
-    view_of = observed.view[used]
+    used = used[np.argsort(observed.view[used], kind="stable")]
+    view_of, points = observed.view[used], observed.point[used]
+    starts = np.searchsorted(view_of, np.arange(len(network.view_camera) + 1))
     rays = _camera_points(network, estimate)[used]
     image = _images(network, estimate, network.view_camera[view_of], rays)
-    x, y, z = rays.T
-    zero = np.zeros_like(x)
-    ray_by_point = np.stack((1.0 / z, zero, -x / z**2, zero, 1.0 / z, -y / z**2), axis=1)
-    by_place = image.by_ray @ ray_by_point.reshape(-1, 2, 3)
-    by_rotation = -by_place @ _cross_matrices(rays - estimate.translations[view_of])
     white = observed.white[used] * np.sqrt(weights[used])[:, None, None]
-    by_view = [by_place, by_rotation]
-    if network.bends is not None:
-        by_height = by_place @ estimate.rotations[view_of][:, :, 2:]
-        by_view.append(by_height * network.bends.shapes[observed.point[used]][:, None, :])
-    by_pose = white @ np.concatenate(by_view, axis=2)
-    by_camera = white @ image.by_parameter
-    residuals = white @ (observed.places[used] - image.places)[:, :, None]
-    by_point = None
-    if not network.points.is_fixed:
-        by_point = white @ by_place @ estimate.rotations[view_of]
-    parameters = len(network.model.names)
-    first_point = network.cameras.values.size
+    x, y, z = rays.T[:, :, None]
+    by_ray = (white @ image.by_ray) / z[:, :, None]
+    by_place = np.empty((len(used), 2, 3))
+    by_place[:, :, :2] = by_ray
+    by_place[:, :, 2] = -(by_ray[:, :, 0] * x + by_ray[:, :, 1] * y) / z
     bend_rows, bend_residuals = _bend_rows(network, estimate)
+    parameters = len(network.model.names)
+    design = np.empty((len(used), 2, parameters + bend_rows.shape[1]))
+    design[:, :, :parameters] = white @ image.by_parameter
+    by_pose = design[:, :, parameters:]
+    by_pose[:, :, :3] = by_place
+    # a rotation ω moves the point by ω × a, so that the row d changes by d · (ω × a) = ω · (a × d)
+    arm_x, arm_y, arm_z = (rays - estimate.translations[view_of]).T[:, :, None]
+    by_x, by_y, by_z = np.moveaxis(by_place, 2, 0)
+    by_pose[:, :, 3] = arm_y * by_z - arm_z * by_y
+    by_pose[:, :, 4] = arm_z * by_x - arm_x * by_z
+    by_pose[:, :, 5] = arm_x * by_y - arm_y * by_x
+    by_point = None
+    if network.bends is not None or not network.points.is_fixed:
+        by_point = by_place @ estimate.rotations[view_of]
+    if network.bends is not None and by_point is not None:
+        by_pose[:, :, 6:] = by_point[:, :, 2:] * network.bends.shapes[points][:, None, :]
+    residuals = white @ (observed.places[used] - image.places)[:, :, None]
+    return NetworkRows(
+        used,
+        starts,
+        points,
+        design.reshape(2 * len(used), -1),
+        None if network.points.is_fixed else by_point,
+        residuals.ravel(),
+        bend_rows,
+        bend_residuals,
+    )
+
+
+def view_rows(network: Network, rows: NetworkRows) -> list[ViewRows]:
+    """Return the equations of every photograph."""
+    parameters, first_point = rows.parameters, network.cameras.values.size
     equations = []
     for view, camera in enumerate(network.view_camera.tolist()):
-        in_view = np.flatnonzero(view_of == view)
+        own = slice(rows.starts[view], rows.starts[view + 1])
+        design = rows.design[2 * own.start : 2 * own.stop]
         columns = camera * parameters + np.arange(parameters)
-        if by_point is not None:
-            points = first_point + 3 * observed.point[used[in_view]][:, None] + np.arange(3)
-            columns = np.concatenate((columns, points.ravel()))
+        if rows.by_point is not None:
+            of_points = first_point + 3 * rows.points[own, None] + np.arange(3)
+            columns = np.concatenate((columns, of_points.ravel()))
         equations.append(
             ViewRows(
-                used[in_view],
+                rows.rows[own],
                 columns,
-                by_pose[in_view].reshape(-1, bend_rows.shape[1]),
-                by_camera[in_view].reshape(-1, parameters),
-                None if by_point is None else by_point[in_view],
-                residuals[in_view].ravel(),
-                bend_rows,
-                bend_residuals[view],
+                design[:, parameters:],
+                design[:, :parameters],
+                None if rows.by_point is None else rows.by_point[own],
+                rows.residuals[2 * own.start : 2 * own.stop],
+                rows.bend_rows,
+                rows.bend_residuals[view],
             )
         )
     return equations
@@ -169,11 +255,13 @@ def _images(
     network: Network, estimate: Estimate, cameras: IndexArray, rays: FloatArray
 ) -> ImageSlopes:
     """Return the images of points (n, 3) in their cameras (n,), with derivatives."""
+    normalised = rays[:, :2] / rays[:, 2:]
+    if len(estimate.cameras) == 1:
+        return network.model.image(estimate.cameras[0], normalised)
     count, parameters = len(rays), len(network.model.names)
     images = ImageSlopes(
         np.empty((count, 2)), np.empty((count, 2, 2)), np.empty((count, 2, parameters))
     )
-    normalised = rays[:, :2] / rays[:, 2:]
     for camera, values in enumerate(estimate.cameras):
         in_camera = cameras == camera
         image = network.model.image(values, normalised[in_camera])
@@ -184,7 +272,7 @@ def _images(
 
 
 def reduce_poses(
-    network: Network, estimate: Estimate, equations: list[ViewRows], damping: float = 0.0
+    network: Network, estimate: Estimate, rows: NetworkRows, damping: float = 0.0
 ) -> ReducedSystem:
     """Return the normal equations of cameras and points, with the poses eliminated.
 
@@ -193,60 +281,39 @@ def reduce_poses(
     damping : float
         Levenberg-Marquardt: each diagonal element is increased by this share of itself.
     """
-    size = network.cameras.values.size
-    if not network.points.is_fixed:
-        size += estimate.points.size
+    parameters, cameras = rows.parameters, network.cameras.values.size
+    size = cameras + (0 if rows.by_point is None else estimate.points.size)
     normal, right = prior_equations(network, estimate, size)
-    diagonal = normal.diagonal().copy()
-    pose_normals, pose_rights, couplings = [], [], []
-    for view in equations:
-        pose_normal, pose_right = view.pose_normal, view.pose_right
-        pose_normal[np.diag_indices(len(pose_normal))] *= 1.0 + damping
-        direct, coupling, direct_right = _unreduced(view)
-        back = np.linalg.solve(pose_normal, coupling.T)
-        normal[np.ix_(view.columns, view.columns)] += direct - coupling @ back
-        right[view.columns] += direct_right - back.T @ pose_right
-        diagonal[view.columns] += direct.diagonal()
-        pose_normals.append(pose_normal)
-        pose_rights.append(pose_right)
-        couplings.append(coupling)
-    normal[np.diag_indices(size)] += damping * diagonal
-    return ReducedSystem(
-        normal,
-        right,
-        np.array(pose_normals),
-        np.array(pose_rights),
-        tuple(couplings),
-        tuple(view.columns for view in equations),
-    )
-
-
-def _unreduced(view: ViewRows) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return a photograph's normal matrix (k, k), coupling to the pose (k, q), right side (k,)."""
-    if view.by_point is None:
-        design = view.by_camera
-        return design.T @ design, design.T @ view.by_pose, design.T @ view.residuals
-    parameters, count = view.by_camera.shape[1], len(view.rows)
-    by_camera = view.by_camera.reshape(count, 2, parameters)
-    by_pose = view.by_pose.reshape(count, 2, -1)
-    residuals = view.residuals.reshape(count, 2)
-    points = view.by_point.transpose(0, 2, 1)
-    size = parameters + 3 * count
-    direct = np.zeros((size, size))
-    direct[:parameters, :parameters] = view.by_camera.T @ view.by_camera
-    across = (points @ by_camera).reshape(3 * count, parameters)
-    direct[parameters:, :parameters] = across
-    direct[:parameters, parameters:] = across.T
-    blocks = direct[parameters:, parameters:].reshape(count, 3, count, 3)
-    index = np.arange(count)
-    blocks[index, :, index, :] = points @ view.by_point
-    coupling = np.vstack(
-        (view.by_camera.T @ view.by_pose, (points @ by_pose).reshape(3 * count, -1))
-    )
-    right = np.concatenate(
-        (view.by_camera.T @ view.residuals, (points @ residuals[:, :, None]).ravel())
-    )
-    return direct, coupling, right
+    normals, rights = rows.normals()
+    couplings = np.zeros((len(normals), size, rows.bend_rows.shape[1]))
+    for camera in range(len(network.cameras.values)):
+        by_camera = network.view_camera == camera
+        own = slice(camera * parameters, (camera + 1) * parameters)
+        normal[own, own] += normals[by_camera, :parameters, :parameters].sum(axis=0)
+        right[own] += rights[by_camera, :parameters].sum(axis=0)
+        couplings[by_camera, own] = normals[by_camera, :parameters, parameters:]
+    if rows.by_point is not None:
+        count = len(estimate.points)
+        parts = PointNormals.of(network, rows, rows.by_point)
+        index = np.arange(count)
+        blocks = normal[cameras:, cameras:].reshape(count, 3, count, 3)
+        blocks[index, :, index, :] += parts.squares
+        across = parts.by_camera.transpose(1, 2, 0, 3).reshape(3 * count, cameras)
+        normal[cameras:, :cameras] += across
+        normal[:cameras, cameras:] += across.T
+        right[cameras:] += parts.right.ravel()
+        # a photograph shows a point at most once
+        of_points = couplings[:, cameras:].reshape(len(normals), count, 3, -1)
+        of_points[rows.views, rows.points] = parts.by_pose
+    diagonal = np.diag_indices(size)
+    pose = np.arange(parameters, normals.shape[1])
+    normals[:, pose, pose] *= 1.0 + damping
+    pose_normals, pose_rights = normals[:, parameters:, parameters:], rights[:, parameters:]
+    back = np.linalg.solve(pose_normals, couplings.transpose(0, 2, 1)).reshape(-1, size)
+    normal[diagonal] *= 1.0 + damping
+    normal -= couplings.transpose(1, 0, 2).reshape(size, -1) @ back
+    right -= back.T @ pose_rights.ravel()
+    return ReducedSystem(normal, right, pose_normals, pose_rights, couplings)
 
 
 def prior_equations(
@@ -307,17 +374,8 @@ def moved(
     network: Network, estimate: Estimate, system: ReducedSystem, step: FloatArray
 ) -> Estimate:
     """Return the estimate after a step (u,) of the reduced unknowns; the poses follow from it."""
-    pose_steps = [
-        np.linalg.solve(normal, right - coupling.T @ step[columns])
-        for normal, right, coupling, columns in zip(
-            system.pose_normals,
-            system.pose_rights,
-            system.couplings,
-            system.columns,
-            strict=True,
-        )
-    ]
-    poses = np.array(pose_steps)
+    rights = system.pose_rights - step @ system.couplings
+    poses = np.asarray(np.linalg.solve(system.pose_normals, rights[:, :, None])[:, :, 0])
     cameras = estimate.cameras.size
     points = estimate.points
     if not network.points.is_fixed:
@@ -369,3 +427,12 @@ def _cross_matrices(vectors: FloatArray) -> FloatArray:
     zero = np.zeros_like(x)
     rows = np.stack((zero, -z, y, z, zero, -x, -y, x, zero), axis=1)
     return rows.reshape(-1, 3, 3)
+
+
+def _sums(values: FloatArray, groups: IndexArray, count: int) -> FloatArray:
+    """Return the sums (count, ...) of values (n, ...) that are in the same group (n,)."""
+    flat = values.reshape(len(values), -1)
+    width = flat.shape[1]
+    index = groups[:, None] * width + np.arange(width)
+    sums = np.bincount(index.ravel(), flat.ravel(), count * width)
+    return np.asarray(sums.reshape(count, *values.shape[1:]))

@@ -16,7 +16,7 @@ from scipy import stats
 
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.network.covariance import REDUNDANCY_POWER, without_pose
-from kgcp.network.equations import ViewRows, view_rows
+from kgcp.network.equations import ViewRows, network_rows, view_rows
 from kgcp.network.records import Estimate, Network, Precision, Solution
 
 # With six or seven places, the scatter is known too badly: of 44 simulated sessions without a
@@ -160,7 +160,7 @@ class _ReducedRows:
 def _reduced_rows(network: Network, solution: Solution) -> list[_ReducedRows]:
     parameters = len(network.model.names)
     found = []
-    for view in view_rows(network, solution.estimate, solution.weights):
+    for view in view_rows(network, network_rows(network, solution.estimate, solution.weights)):
         column = _by_scale(network, solution.estimate, view)
         design = np.hstack((view.by_camera, column[:, None]))
         rows, left = without_pose(replace(view, by_camera=design))

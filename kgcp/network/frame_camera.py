@@ -56,10 +56,12 @@ class FrameCameraModel:
     def image(self, values: FloatArray, normalised: FloatArray) -> ImageSlopes:
         """Map normalised coordinates (n, 2) to pixels, with derivatives."""
         camera = self.camera(values)
+        by_calibration = distort_jacobian_by_calibration(camera, normalised)
+        by_calibration = by_calibration.reshape(2 * len(normalised), -1)
         return ImageSlopes(
             camera.distort(normalised),
             camera.distort_jacobian(normalised),
-            distort_jacobian_by_calibration(camera, normalised) @ self.to_calibration(),
+            (by_calibration @ self.to_calibration()).reshape(len(normalised), 2, -1),
         )
 
     def to_calibration(self) -> FloatArray:

@@ -24,7 +24,7 @@ import numpy as np
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.network.calibration_records import CameraCalibration
 from kgcp.network.covariance import without_pose
-from kgcp.network.equations import prior_cost, reduce_poses, view_rows
+from kgcp.network.equations import network_rows, prior_cost, reduce_poses, view_rows
 from kgcp.network.frame_camera import DISTORTION, FrameCameraModel
 from kgcp.network.records import CalibrationPrior, Network, Solution
 
@@ -190,8 +190,9 @@ def _blocks(
         Normal matrix of the prior of the values, which are zero by it.
     """
     estimate = solution.estimate
-    equations = view_rows(network, estimate, solution.weights)
-    system = reduce_poses(network, estimate, equations)
+    all_rows = network_rows(network, estimate, solution.weights)
+    system = reduce_poses(network, estimate, all_rows)
+    equations = view_rows(network, all_rows)
     others = np.setdiff1d(np.arange(len(system.normal)), replaced)
     couplings = np.zeros((len(equations), len(system.normal), values.shape[1]))
     squares = prior_cost(network, estimate)

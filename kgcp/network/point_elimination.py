@@ -13,7 +13,7 @@ import numpy as np
 from scipy import linalg
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.network.equations import ViewRows, scales_of
+from kgcp.network.equations import NetworkRows, PointNormals, scales_of
 from kgcp.network.records import Estimate, Network
 
 
@@ -38,49 +38,46 @@ def can_eliminate_points(network: Network) -> bool:
 
 
 def reduce_points(
-    network: Network, estimate: Estimate, equations: list[ViewRows], damping: float = 0.0
+    network: Network, estimate: Estimate, rows: NetworkRows, damping: float = 0.0
 ) -> PointReducedSystem:
     """Return the equations of cameras and poses, damped as by `reduce_poses`."""
     information = network.points.information
-    if information is None:
+    if information is None or rows.by_point is None:
         raise ValueError("the points are no unknowns")
-    cameras, parameters = network.cameras.values.size, network.cameras.values.shape[1]
-    view_unknowns = 6 + network.bend_count
-    size = cameras + view_unknowns * len(equations)
+    normals, rights = rows.normals()
+    views, parameters, unknowns = len(normals), rows.parameters, rows.bend_rows.shape[1]
+    cameras, count = network.cameras.values.size, len(estimate.points)
+    size = cameras + unknowns * views
     normal, right = np.zeros((size, size)), np.zeros(size)
     camera_information = network.cameras.sd.ravel() ** -2.0
     normal[np.arange(cameras), np.arange(cameras)] = camera_information
     right[:cameras] = camera_information * (network.cameras.values - estimate.cameras).ravel()
-    coupling = np.zeros((size, len(estimate.points), 3))
-    blocks = information.copy()
+    right[cameras:] = rights[:, parameters:].ravel()
+    index = np.arange(views)
+    poses = normal[cameras:, cameras:].reshape(views, unknowns, views, unknowns)
+    poses[index, :, index, :] = normals[:, parameters:, parameters:]
+    for camera in range(len(network.cameras.values)):
+        by_camera = network.view_camera == camera
+        own = slice(camera * parameters, (camera + 1) * parameters)
+        normal[own, own] += normals[by_camera, :parameters, :parameters].sum(axis=0)
+        right[own] += rights[by_camera, :parameters].sum(axis=0)
+        across = normal[own, cameras:].reshape(parameters, views, unknowns)
+        across[:, by_camera] = normals[by_camera, :parameters, parameters:].transpose(1, 0, 2)
+    normal[cameras:, :cameras] = normal[:cameras, cameras:].T
+    parts = PointNormals.of(network, rows, rows.by_point)
+    coupling = np.zeros((size, count, 3))
+    coupling[:cameras] = parts.by_camera.transpose(0, 3, 1, 2).reshape(cameras, count, 3)
+    # a photograph shows a point at most once
+    of_poses = coupling[cameras:].reshape(views, unknowns, count, 3)
+    of_poses[rows.views, :, rows.points] = parts.by_pose.transpose(0, 2, 1)
+    blocks = information + parts.squares
     gaps = network.points.nominal - estimate.points
-    point_right = np.einsum("nij,nj->ni", information, gaps)
-    for index, view in enumerate(equations):
-        if view.by_point is None:
-            continue
-        first = int(network.view_camera[index]) * parameters
-        pose = cameras + view_unknowns * index + np.arange(view_unknowns)
-        columns = np.concatenate((first + np.arange(parameters), pose))
-        design = np.hstack((view.by_camera, view.by_pose))
-        normal[np.ix_(columns, columns)] += design.T @ design
-        right[columns] += design.T @ view.residuals
-        normal[np.ix_(pose, pose)] += view.bend_rows.T @ view.bend_rows
-        right[pose] += view.bend_rows.T @ view.bend_residuals
-        count = len(view.rows)
-        points = network.observations.point[view.rows]
-        across = view.by_point.transpose(0, 2, 1)
-        # a photograph shows a point at most once, so that `+=` adds all
-        blocks[points] += across @ view.by_point
-        residuals = view.residuals.reshape(count, 2, 1)
-        point_right[points] += (across @ residuals)[:, :, 0]
-        rows = design.reshape(count, 2, -1).transpose(0, 2, 1) @ view.by_point
-        coupling[np.ix_(columns, points)] += rows.transpose(1, 0, 2)
+    point_right = parts.right + np.einsum("nij,nj->ni", information, gaps)
     diagonal = np.arange(3)
     blocks[:, diagonal, diagonal] *= 1.0 + damping
     normal[np.diag_indices(size)] *= 1.0 + damping
     inverses = np.asarray(np.linalg.inv(blocks), dtype=np.float64)
-    carried = np.einsum("xmi,mij->xmj", coupling, inverses)
-    flat = carried.reshape(size, -1)
+    flat = np.matmul(coupling.transpose(1, 0, 2), inverses).transpose(1, 0, 2).reshape(size, -1)
     return PointReducedSystem(
         normal - flat @ coupling.reshape(size, -1).T,
         right - flat @ point_right.ravel(),

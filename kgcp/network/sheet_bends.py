@@ -13,7 +13,7 @@ from scipy import stats
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.network.covariance import bend_cofactors
-from kgcp.network.equations import computed, view_rows
+from kgcp.network.equations import computed, network_rows, view_rows
 from kgcp.network.records import BendPrior, Estimate, Network, Solution
 
 _FALSE_ALARM = 0.001  # probability that a rigid board is taken for one that bends
@@ -51,7 +51,7 @@ def first_bends(network: Network, solution: Solution, shapes: FloatArray) -> Ben
     views, count = len(network.view_camera), shapes.shape[1]
     estimate = solution.estimate.with_zero_bends(count)
     explained, amounts = 0.0, []
-    for view in view_rows(trial, estimate, solution.weights):
+    for view in view_rows(trial, network_rows(trial, estimate, solution.weights)):
         basis = np.linalg.qr(view.by_pose[:, :6])[0]
         by_bend = view.by_pose[:, 6:] - basis @ (basis.T @ view.by_pose[:, 6:])
         score = by_bend.T @ view.residuals

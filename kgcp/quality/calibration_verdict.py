@@ -10,7 +10,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.network.calibration_records import CameraCalibration, LensModel, PointModel
-from kgcp.network.equations import view_rows, whitened
+from kgcp.network.equations import network_rows, view_rows, whitened
 from kgcp.network.field_deviation import FieldDeviation, field_deviation
 from kgcp.network.focal_changes import FocalChanges, FocalStep, FocalTrend, focal_changes
 from kgcp.network.photograph_groups import other_camera, turned_photographs
@@ -177,7 +177,7 @@ def change_if_neglected(calibration: CameraCalibration) -> dict[str, float]:
     network, solution = calibration.network, calibration.solution
     fixed = replace(network, points=PointPrior(solution.estimate.points, None), bends=None)
     weights = solution.is_used.astype(np.float64)
-    equations = view_rows(fixed, solution.estimate, weights)
+    equations = view_rows(fixed, network_rows(fixed, solution.estimate, weights))
     shifts = whitened(fixed, calibration.eccentricity.total_px, weights)
     parameters = len(network.model.names)
     rows = sum(len(view.residuals) for view in equations)

@@ -21,6 +21,7 @@ from kgcp.network.equations import (
     computed,
     inner_constraints,
     moved,
+    network_rows,
     reduce_poses,
     scales_of,
     view_rows,
@@ -31,7 +32,7 @@ from kgcp.network.point_elimination import (
     moved_by_points,
     reduce_points,
 )
-from kgcp.network.records import Estimate, PointPrior, ScaleBar
+from kgcp.network.records import CalibrationPrior, Estimate, PointPrior, ScaleBar
 from tests.network.conftest import SD_PX, simulated
 
 FIELDS = os.environ.get("KGCP_FIELDS", "")  # where the open sets of photographs are
@@ -42,8 +43,8 @@ def test_derivatives_equal_those_of_the_projection(rng: np.random.Generator) -> 
     free = PointPrior(simulated().network.points.nominal, np.zeros((35, 3, 3)))
     made = simulated(3, points=free)
     network, estimate = made.network, made.start(rng)
-    rows = view_rows(network, estimate, np.ones(35 * 3))
-    view = rows[1]
+    rows = network_rows(network, estimate, np.ones(35 * 3))
+    view = view_rows(network, rows)[1]
     dense = view.dense()
     for column, step in ((0, 1e-3), (1, 1e-3), (3, 1e-6), (7, 1e-7), (11, 1e-7)):
         change = np.zeros(5 + 35 * 3)
@@ -232,15 +233,23 @@ def test_a_published_adjustment_is_reproduced() -> None:
     assert result.points_mm < 0.0005
 
 
-def test_points_may_be_eliminated_instead_of_poses(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_points_may_be_eliminated_instead_of_poses(rng: np.random.Generator, cameras: int) -> None:
     """Both eliminations give the same step and the same share of the priors."""
     bend = 0.0002 * rng.standard_normal((35, 3))
     nominal = simulated().network.points.nominal
     information = np.broadcast_to(np.diag([1.0, 2.0, 0.5]) / 0.0002**2, (35, 3, 3))
     made = simulated(points=PointPrior(nominal, information), displaced_m=bend).observed(rng)
     network, start = made.network, made.start(rng)
+    prior = network.cameras
+    network = replace(
+        network,
+        view_camera=np.arange(len(network.view_camera)) % cameras,
+        cameras=CalibrationPrior(prior.values.repeat(cameras, 0), prior.sd.repeat(cameras, 0)),
+    )
+    start = replace(start, cameras=start.cameras.repeat(cameras, 0))
     weights = rng.uniform(0.2, 1.0, len(network.observations.view))
-    equations = view_rows(network, start, weights)
+    equations = network_rows(network, start, weights)
     assert can_eliminate_points(network)
     by_points = moved_by_points(network, start, reduce_points(network, start, equations, 0.0))
     system = reduce_poses(network, start, equations)
@@ -253,7 +262,8 @@ def test_points_may_be_eliminated_instead_of_poses(rng: np.random.Generator) -> 
     assert np.allclose(by_points.rotations, by_poses.rotations, atol=1e-11)
     shares = determined_by_priors(network, reduce_points(network, start, equations))
     inverse = np.linalg.inv(system.normal)
-    blocks = inverse[5:, 5:].reshape(35, 3, 35, 3)[np.arange(35), :, np.arange(35), :]
+    first = 5 * cameras
+    blocks = inverse[first:, first:].reshape(35, 3, 35, 3)[np.arange(35), :, np.arange(35), :]
     assert shares == pytest.approx(float(np.sum(blocks * information)), rel=1e-6)
 
 
