@@ -61,6 +61,7 @@ from kgcp.quality.checks.place import check_grid_scale, check_place
 from kgcp.quality.checks.plate import check_plates
 from kgcp.quality.checks.reference import check_reference, check_visibility
 from kgcp.quality.checks.spikes import check_spikes
+from kgcp.quality.checks.static_targets import check_overlaps
 from kgcp.quality.consistency import Consistency, study_consistency
 
 SAMPLED_FRAMES = 100
@@ -254,6 +255,7 @@ class FlightInputs:
             doubts += check_lever_arm(flight.vehicle.settings, moving)
             doubts += check_vehicle_deviations(flight.vehicle.settings)
         if self.target_positions is not None and not _has_wrong_places(doubts):
+            doubts += check_overlaps(flight.static_targets, self.target_positions.static)
             doubts += check_attitude(self.course)
             vehicle = self.target_positions.vehicle
             if vehicle is not None and self.trajectory is not None:

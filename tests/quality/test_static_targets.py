@@ -18,12 +18,14 @@ from kgcp.georef.trajectory import Motion
 from kgcp.quality.checks.doubt import Cause, Doubt
 from kgcp.quality.checks.static_targets import (
     PlainSearch,
+    check_overlaps,
     check_places,
     check_searches,
     check_static_targets,
     check_vehicle,
 )
 from kgcp.settings import VehicleSettings
+from kgcp.targets.plain import PlainPolarity, PlainTarget
 from tests.ground_flight import CAMERA, GroundFlight
 
 Changed = Callable[[int, str, Pose], tuple[str, Pose]]
@@ -429,3 +431,16 @@ def test_a_plain_target_that_is_hardly_ever_found_is_named() -> None:
     assert doubt.sentence.startswith("C: found at 0 of 10 places")
     assert not doubt.is_grave
     assert "polarity" in doubt.remedy
+
+
+@pytest.mark.parametrize(
+    ("apart_m", "sd_m", "doubts"), [(0.0, 0.0, 1), (0.2, 0.01, 1), (0.2, 0.3, 0), (0.6, 0.0, 0)]
+)
+def test_targets_that_would_overlap_are_named(apart_m: float, sd_m: float, doubts: int) -> None:
+    """They would if they are closer than the sum of their radii, beyond three deviations."""
+    dark, place = PlainPolarity.DARK, (0.0, 0.0, 0.0)
+    targets = [PlainTarget(name, (0.5,), dark, position_m=place) for name in "AB"]
+    cov_m2 = sd_m**2 * np.eye(3) if sd_m else None
+    there = np.array([apart_m, 0.0, 0.0])
+    positions = {"A": TargetPosition(0.0 * there, cov_m2), "B": TargetPosition(there, cov_m2)}
+    assert len([*check_overlaps(targets, positions)]) == doubts

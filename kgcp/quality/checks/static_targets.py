@@ -1,4 +1,4 @@
-"""Checks of static targets against each other, without poses, and against reference poses."""
+"""Checks of static targets: positions, measurements without poses, and reference poses."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from kgcp.georef.sighting import CAMERA_SPEED_M_S, Sighting, unmistakable
 from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
 from kgcp.quality.number_text import listed, rounded
+from kgcp.targets.plain import AnyTarget
 
 # A distance between two targets in one frame contradicts their positions if it is off by more than
 # this number of standard deviations.
@@ -37,6 +38,7 @@ _CALIBRATION_SD_PX, _UNSTATED_POSE_SD_PX = 2.0, 5.0
 # Probability with which errors as stated are as large as those of reference poses that are doubted
 _UNLIKELY_OFF = 0.01
 _MIN_SEARCHES, _RARELY = 5, 0.25  # of a target, and the share of them in which it is rarely found
+_OVERLAP_SDS = 3.0  # standard deviations of positions, within which targets may not overlap
 _MIN_OFF_M = 0.05  # of a target from its position, by reference poses
 _MIN_VEHICLE_OFF_M = 0.1  # of a distance between the targets on vehicle and ground
 _ALIKE_SHARE = 0.2  # of their offset, by which targets differ that all lie alike
@@ -108,6 +110,33 @@ def _rarely_found(searches: Sequence[PlainSearch]) -> Iterator[Doubt]:
             " exchanged; if it is so with most targets, the standard deviations of the poses",
             {"searched": places, "found": there},
         )
+
+
+def check_overlaps(
+    targets: Sequence[AnyTarget], positions: Mapping[str, TargetPosition]
+) -> Iterator[Doubt]:
+    """Yield doubts about targets that would lie on each other, as if one entry were a copy.
+
+    Parameters
+    ----------
+    positions : mapping of str to TargetPosition
+        Positions of the static targets in the ENU frame.
+    """
+    placed = [(target, positions[target.name]) for target in targets if target.name in positions]
+    for (first, place), (second, other) in combinations(placed, 2):
+        apart_m = float(np.linalg.norm(place.position_m - other.position_m))
+        covs = [each.cov_m2 for each in (place, other) if each.cov_m2 is not None]
+        sd_m = math.sqrt(sum(float(np.trace(cov)) for cov in covs))
+        radii_m = 0.5 * (first.outer_diameter_m + second.outer_diameter_m)
+        if apart_m + _OVERLAP_SDS * sd_m < radii_m:
+            yield mild(
+                Cause.STATIC_TARGETS,
+                f"targets {first.name!r} and {second.name!r} overlap: their positions are"
+                f" {apart_m:.2g} m apart, their outer diameters {first.outer_diameter_m:g} and"
+                f" {second.outer_diameter_m:g} m",
+                "correct position_m of one of them",
+                {"apart_m": apart_m},
+            )
 
 
 def check_static_targets(
