@@ -10,13 +10,14 @@ from typing import Self
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.attitude import ReferencePoses, place_covariances
+from kgcp.geometry.attitude import ReferencePoses, cross_matrix, place_covariances
 from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import rotation_about
 from kgcp.georef.exterior_orientation import ExteriorOrientations, visible_pixel
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.target_positions import TargetPositions
 from kgcp.measurement.plain_prediction import PlainPrediction, PredictedPlace
-from kgcp.measurement.plate_prior import NormalPrior
+from kgcp.measurement.plate_prior import NormalPrior, SceneRotation
 from kgcp.targets.plain import AnyTarget, PlainTarget
 
 # Least standard deviations of a centre and of the logarithm of a distance, whatever is stated.
@@ -29,9 +30,13 @@ _UNSTATED_SD_PX, _UNSTATED_SD_LOG = 5.0, 0.01
 # that looks down, and of the logarithm of a distance.
 _DOWN_SD_DEG, _MARKED_SD_LOG = 10.0, 0.08
 _MIN_LEVEL_UP = 0.95  # least upward component of the normal of a level target
+_ROW_STEPS = 3  # a target's row depends on the motion until that row, by some per cent
 
 Predictions = Mapping[str, PlainPrediction]
 """Predictions by the target's name."""
+
+Rotations = Mapping[str, SceneRotation]
+"""How the scene turns while a rolling shutter reads a frame, by the target's name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,26 +86,33 @@ def predict_plain(
     orientation: FrameOrientation,
     positions: TargetPositions,
     camera: Camera,
+    rotations: Rotations,
 ) -> Predictions:
     """Predict plain targets in a frame; those behind the camera are left out.
 
     The standard deviations follow from those of the frame's orientation and of the target's
-    position.
+    position, and with a rolling shutter from that of the motion until the target's row.
+
+    Parameters
+    ----------
+    rotations : mapping
+        The known ones.
     """
+    sights = _sights(targets, orientation, positions, camera, rotations)
     all_predictions = {
-        target.name: _predicted(target, orientation, positions, camera) for target in targets
+        target.name: _predicted(target, sights[target.name], orientation, positions)
+        for target in targets
     }
     return {name: value for name, value in all_predictions.items() if value is not None}
 
 
 def _predicted(
     target: PlainTarget,
+    sight: _Sight | None,
     orientation: FrameOrientation,
     positions: TargetPositions,
-    camera: Camera,
 ) -> PlainPrediction | None:
     """Predict one target; None if it is not in front of the camera."""
-    sight = _Sight.of(target, orientation, positions, camera)
     if sight is None:
         return None
     distance_m = float(np.linalg.norm(sight.position_m))
@@ -124,10 +136,27 @@ def predict_places(
     orientation: FrameOrientation,
     positions: TargetPositions,
     camera: Camera,
+    rotations: Rotations,
 ) -> dict[str, PredictedPlace]:
-    """Predict the places of static targets; those behind the camera are left out."""
-    sights = {each.name: _Sight.of(each, orientation, positions, camera) for each in targets}
+    """Predict the places of static targets, as `predict_plain`."""
+    sights = _sights(targets, orientation, positions, camera, rotations)
     return {name: sight.place for name, sight in sights.items() if sight is not None}
+
+
+def _sights(
+    targets: Sequence[AnyTarget],
+    orientation: FrameOrientation,
+    positions: TargetPositions,
+    camera: Camera,
+    rotations: Rotations,
+) -> dict[str, _Sight | None]:
+    unknown = SceneRotation.unknown(camera)
+    return {
+        each.name: _Sight.of(
+            each, orientation, positions, camera, rotations.get(each.name, unknown)
+        )
+        for each in targets
+    }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,8 +174,9 @@ class _Sight:
         orientation: FrameOrientation,
         positions: TargetPositions,
         camera: Camera,
+        rotation: SceneRotation,
     ) -> Self | None:
-        """Return it; None if the target is not in front of the camera."""
+        """Return it at the moment of its row; None if it is not in front of the camera."""
         static = positions.static[target.name]
         camera_from_enu = orientation.enu_from_camera.T
         from_centre_m = static.position_m - orientation.centre_m
@@ -160,13 +190,21 @@ class _Sight:
             min_sd_px = _MIN_SD_PX
             cov_m2 = cov_m2 + place_covariances(orientation.cov, from_centre_m)
         cov_m2 = camera_from_enu @ cov_m2 @ camera_from_enu.T
+        if camera.readout_s:
+            # the scene turns until the target's row is exposed
+            velocity, middle_m, delay_s = np.array(rotation.velocity_rad_s), sight_m, 0.0
+            for _ in range(_ROW_STEPS):
+                delay_s = float(camera.delay_s(centre_px[None])[0])
+                sight_m = rotation_about(delay_s * velocity) @ middle_m
+                centre_px = visible_pixel(camera, sight_m)
+                if not np.isfinite(centre_px).all():
+                    return None
+            by_turn = delay_s * rotation.sd_rad_s * cross_matrix(sight_m)
+            cov_m2 = cov_m2 + by_turn @ by_turn.T
         by_position = _pixel_by_position(camera, sight_m)
-        # with a rolling shutter, the camera moves until the target's row is exposed
-        delay_s = float(camera.delay_s(centre_px[None])[0])
-        turn_px = math.radians(camera.motion_sd_deg_s) * delay_s * camera.mean_focal_px
         place = PredictedPlace(
             centre_px,
-            by_position @ cov_m2 @ by_position.T + (min_sd_px**2 + turn_px**2) * np.eye(2),
+            by_position @ cov_m2 @ by_position.T + min_sd_px**2 * np.eye(2),
             0.5 * target.outer_diameter_m * camera.mean_focal_px / float(np.linalg.norm(sight_m)),
         )
         return cls(sight_m, cov_m2, place)

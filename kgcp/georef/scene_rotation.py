@@ -20,6 +20,7 @@ from kgcp.measurement.plate_prior import SceneRotation
 
 _MAX_COMPARED = 8  # nearest frames from which the uncertainty of a rotation is estimated
 _MIN_COMPARED = 4  # least number of such frames in a flight
+_MAX_INTERVALS = 1.5  # to the neighbour of the first frame or the last, in usual intervals
 # Vibration that is too fast for frames to show, as shares of the a-priori standard deviations of
 # rotation and velocity. It turns a camera far more than it shifts it: at 5°/s and 30 m, the share
 # of the velocity is 0.1 m/s.
@@ -39,14 +40,14 @@ class CameraMotions:
     is_observed: BoolArray
 
 
-def combine_with_prior(
-    observed_rad_s: FloatArray, sd_rad_s: float, a_priori: SceneRotation
-) -> SceneRotation:
-    """Return the weighted mean of an observed rotation (3,) and the a-priori one."""
-    prior = np.array(a_priori.velocity_rad_s)
-    mean, sd = _weighted(observed_rad_s, sd_rad_s, prior, a_priori.sd_rad_s)
-    x, y, z = mean.tolist()
-    return SceneRotation((x, y, z), sd)
+def more_certain(by_rates: SceneRotation, by_frames: SceneRotation | None) -> SceneRotation:
+    """Return the rotation by the camera's rates, unless that by the frames around is better known.
+
+    They are not averaged: the frames around do not show vibration, which the rates do.
+    """
+    if by_frames is not None and by_frames.sd_rad_s < by_rates.sd_rad_s:
+        return by_frames
+    return by_rates
 
 
 def rotations_between_frames(
@@ -54,6 +55,7 @@ def rotations_between_frames(
     sight_m: FloatArray,
     camera_from_plate: FloatArray,
     a_priori: SceneRotation,
+    vibration_share: float = _VIBRATION_SHARE,
 ) -> list[SceneRotation]:
     """Return the scene's rotation at every frame, by central differences over neighbouring frames.
 
@@ -67,21 +69,58 @@ def rotations_between_frames(
         Attitude of the plate, or of the vehicle under it, in the camera frame.
     a_priori : SceneRotation
         Each observed rotation is combined with it, by their weights.
+    vibration_share : float
+        What the frames do not show, as a share of the a-priori standard deviation.
 
     Returns
     -------
     list of SceneRotation
-        The a-priori rotation for frames without neighbours on both sides, and for all frames if
-        there are too few to compare.
+        The a-priori rotation for all frames if there are too few to compare.
     """
     near, is_near = _differences(time_s, sight_m, camera_from_plate, 1)
     wide, is_wide = _differences(time_s, sight_m, camera_from_plate, 2)
     prior = np.tile(a_priori.velocity_rad_s, (len(time_s), 1))
     sd_prior = np.full(len(time_s), a_priori.sd_rad_s)
-    rates, sds = _posterior(time_s, near, is_near, wide, is_wide, prior, sd_prior, _VIBRATION_SHARE)
+    rates, sds = _posterior(time_s, near, is_near, wide, is_wide, prior, sd_prior, vibration_share)
     return [
         SceneRotation((x, y, z), sd)
         for (x, y, z), sd in zip(rates.tolist(), sds.tolist(), strict=True)
+    ]
+
+
+def rotations_by_places(
+    time_s: FloatArray,
+    sight_m: FloatArray,
+    enu_from_camera: FloatArray,
+    enu_from_plate: FloatArray,
+    a_priori: SceneRotation,
+) -> list[SceneRotation]:
+    """Return what camera and plate add to the scene's rotation by their places, at every frame.
+
+    It is the scene's rotation without that of the camera itself, and hardly has any vibration.
+
+    Parameters
+    ----------
+    sight_m : (n, 3) array
+        From projection centre to target, in ENU axes [m].
+    enu_from_camera, enu_from_plate : (n, 3, 3) arrays
+    time_s, a_priori
+        As `rotations_between_frames`.
+
+    Returns
+    -------
+    list of SceneRotation
+        About the camera's axes.
+    """
+    about_enu = rotations_between_frames(
+        time_s, sight_m, enu_from_plate, a_priori, _VIBRATION_SHARE_OF_VELOCITY
+    )
+    about_camera = np.einsum(
+        "nji,nj->ni", enu_from_camera, [rotation.velocity_rad_s for rotation in about_enu]
+    )
+    return [
+        SceneRotation((x, y, z), rotation.sd_rad_s)
+        for (x, y, z), rotation in zip(about_camera.tolist(), about_enu, strict=True)
     ]
 
 
@@ -89,7 +128,8 @@ def camera_motions(
     time_s: FloatArray,
     centre_m: FloatArray,
     enu_from_camera: FloatArray,
-    turns: Sequence[SceneRotation],
+    rates: Sequence[SceneRotation | None],
+    unknown: SceneRotation,
     distance_m: float,
 ) -> CameraMotions:
     """Return velocity and rotation of a camera at n frames, by central differences over its poses.
@@ -100,35 +140,35 @@ def camera_motions(
         Mid-exposures [s], in any order; NaN: not known.
     centre_m, enu_from_camera : (n, 3) and (n, 3, 3) arrays
         As in `ExteriorOrientations`.
-    turns : sequence of SceneRotation
-        A-priori rotation of the scene in the camera frame. The a-priori velocity of the camera is
-        zero; its standard deviation is that of the rotation times the distance.
+    rates : sequence of SceneRotation or None
+        Rotation of the scene by the camera's own rates, in the camera frame; None: not measured.
+    unknown : SceneRotation
+        A-priori rotation of the scene. The a-priori velocity of the camera is zero; its standard
+        deviation is that of the rotation times the distance.
     distance_m : float
         Approximate distance of what is imaged.
     """
-    sds = np.array([turn.sd_rad_s for turn in turns])
-    # the camera turns opposite to the scene
-    turn = -np.einsum("nij,nj->ni", enu_from_camera, [turn.velocity_rad_s for turn in turns])
-    velocity, sd_velocity = np.zeros_like(turn), sds * distance_m
-    sd_turn, is_observed = sds.copy(), np.zeros(len(sds), dtype=np.bool_)
+    sds = np.full(len(time_s), unknown.sd_rad_s)
+    turn, velocity = np.zeros((len(sds), 3)), np.zeros((len(sds), 3))
+    sd_turn, sd_velocity = sds.copy(), sds * distance_m
+    is_observed = np.zeros(len(sds), dtype=np.bool_)
     known = np.flatnonzero(np.isfinite(time_s))
     rows = known[np.unique(time_s[known], return_index=True)[1]]  # one frame per time
     at_s, centres, axes = time_s[rows], centre_m[rows], enu_from_camera[rows]
     near, is_near = _camera_rates(at_s, centres, axes, 1)
     wide, is_wide = _camera_rates(at_s, centres, axes, 2)
-    turn[rows], sd_turn[rows] = _posterior(
-        at_s, near[:, 3:], is_near, wide[:, 3:], is_wide, turn[rows], sds[rows], _VIBRATION_SHARE
-    )
-    velocity[rows], sd_velocity[rows] = _posterior(
-        at_s,
-        near[:, :3],
-        is_near,
-        wide[:, :3],
-        is_wide,
-        velocity[rows],
-        sd_velocity[rows],
-        _VIBRATION_SHARE_OF_VELOCITY,
-    )
+    for part, rate, sd, share in (
+        (slice(0, 3), velocity, sd_velocity, _VIBRATION_SHARE_OF_VELOCITY),
+        (slice(3, 6), turn, sd_turn, _VIBRATION_SHARE),
+    ):
+        rate[rows], sd[rows] = _posterior(
+            at_s, near[:, part], is_near, wide[:, part], is_wide, rate[rows], sd[rows], share
+        )
+    for row, measured in enumerate(rates):
+        if measured is not None and measured.sd_rad_s < sd_turn[row]:
+            # the camera turns opposite to the scene
+            turn[row] = -enu_from_camera[row] @ np.array(measured.velocity_rad_s)
+            sd_turn[row] = measured.sd_rad_s
     is_observed[rows] = sd_velocity[rows] < sds[rows] * distance_m
     return CameraMotions(velocity, sd_velocity, turn, sd_turn, is_observed)
 
@@ -146,21 +186,35 @@ def _posterior(
     """Return rates (n, 3) and their standard deviations (n,): observed ones combined with priors.
 
     The standard deviation of an observed rate, over one frame before and after (`near`), is its RMS
-    difference from the rate over two frames before and after (`wide`), in the nearest frames.
+    difference from the rate over two frames before and after (`wide`), in the nearest frames. The
+    first frame and the last have the rate of their neighbour, with the RMS change from one frame
+    to the next. What the flight does by these rates is a priori likely: otherwise a prior of 5°/s
+    would draw the rates of a flight at 30°/s towards zero.
     """
     rates, sds = prior.copy(), sd_prior.copy()
     compared = np.flatnonzero(is_near & is_wide)
     if len(compared) < _MIN_COMPARED:
         return rates, sds
     off2 = np.mean((near - wide)[compared] ** 2, axis=1)
-    for row in np.flatnonzero(is_near):
+    shown2 = float(np.mean(near[compared] ** 2) - off2.mean())
+    sds = np.maximum(sds, math.sqrt(max(0.0, shown2)))
+    inner = np.flatnonzero(is_near)
+    changes2 = np.mean(np.diff(near[compared], axis=0) ** 2, axis=1)
+    usual_s = float(np.median(np.diff(time_s[inner])))
+    for row in range(len(time_s)):
         # times ascend, so that the nearest frames are among as many on either side
         place = int(np.searchsorted(compared, row))
         around = np.arange(max(place - _MAX_COMPARED, 0), min(place + _MAX_COMPARED, len(compared)))
         order = np.argsort(np.abs(time_s[compared[around]] - time_s[row]), kind="stable")
         nearest = around[order[:_MAX_COMPARED]]
-        sd = math.hypot(math.sqrt(float(off2[nearest].mean())), vibration_share * sd_prior[row])
-        rates[row], sds[row] = _weighted(near[row], sd, prior[row], float(sd_prior[row]))
+        shown_by = int(inner[np.argmin(np.abs(time_s[inner] - time_s[row]))])
+        error2 = off2[nearest]
+        if shown_by != row:
+            if abs(time_s[shown_by] - time_s[row]) > _MAX_INTERVALS * usual_s:
+                continue
+            error2 = changes2[np.minimum(nearest, len(changes2) - 1)]
+        sd = math.hypot(math.sqrt(float(error2.mean())), vibration_share * sd_prior[row])
+        rates[row], sds[row] = _weighted(near[shown_by], sd, prior[row], float(sds[row]))
     return rates, sds
 
 

@@ -308,11 +308,9 @@ def _kept_frames(
 def _frame_inputs(flight: Flight, data: FlightData, frames: Sequence[str]) -> list[FrameInput]:
     """Return the frames with prior knowledge of each."""
     times = data.frame_times.time_s
+    all_priors = priors_of_frames(flight, data, frames)
     rows = zip(
-        frames,
-        priors_of_frames(flight, data, frames),
-        static_by_reference(flight, data, frames),
-        strict=True,
+        frames, all_priors, static_by_reference(flight, data, frames, all_priors), strict=True
     )
     return [
         FrameInput(
@@ -359,7 +357,13 @@ def _look_for_plain(run: DetectionRun, task: _DetectionTask, looks: int) -> None
     tried: set[tuple[int, str]] = set()
     for look in range(looks):
         plain = plain_by_results(
-            task.flight, task.data, run.results(), run.tracks.time_s, task.marks, tried
+            task.flight,
+            task.data,
+            run.results(),
+            run.tracks.time_s,
+            task.marks,
+            [each.priors for each in task.inputs],
+            tried,
         )
         sure = {
             row: {name: each for name, each in predictions.items() if each.is_sure}
@@ -404,7 +408,8 @@ def _marks(
                 " exchanged; exchange their names, or look at their position_m",
                 option="places",
             )
-    wrong = marks_against_reference(flight, data, marks)
+    priors = dict(zip(frames, priors_of_frames(flight, data, frames), strict=True))
+    wrong = marks_against_reference(flight, data, marks, priors)
     if wrong is not None:
         raise KgcpError(f"{places}: {_contradiction(wrong)}", option="places")
     return marks

@@ -16,8 +16,9 @@ from kgcp.georef.plate_priors import CameraAttitudes, normal_priors
 from kgcp.georef.scene_rotation import (
     CameraMotions,
     camera_motions,
-    combine_with_prior,
+    more_certain,
     rotations_between_frames,
+    rotations_by_places,
 )
 from kgcp.georef.sighting import Attempt
 from kgcp.georef.target_positions import TargetPosition, Vehicle
@@ -48,9 +49,7 @@ def priors_of_frames(flight: Flight, data: FlightData, frames: Sequence[str]) ->
     normals = _normals(flight, data, frames, time_s, moving)
     by_target = {target.name: normals for target in moving}
     rotations = {
-        target.name: _with_rates(
-            flight, data, frames, _rotations(flight, data, frames, time_s, target)
-        )
+        target.name: _rotations(flight, data, frames, time_s, target)
         for target in flight.all_targets
     }
     unknown: list[NormalPrior | None] = [None] * len(frames)
@@ -90,24 +89,6 @@ def _normals(
     return normal_priors(frames, time_s, attitudes, vehicle, level_sd_deg)
 
 
-def _with_rates(
-    flight: Flight,
-    data: FlightData,
-    frames: Sequence[str],
-    by_frames_around: Mapping[int, SceneRotation],
-) -> dict[int, SceneRotation]:
-    """Combine the camera's rotation rates in the times file with those from adjacent frames."""
-    rotations = dict(by_frames_around)
-    unknown, rates = SceneRotation.unknown(flight.camera), data.scene_rotations
-    for row, frame in enumerate(frames):
-        if frame in rates:
-            velocity = np.array(rates[frame].velocity_rad_s)
-            rotations[row] = combine_with_prior(
-                velocity, rates[frame].sd_rad_s, rotations.get(row, unknown)
-            )
-    return rotations
-
-
 def _rotations(
     flight: Flight,
     data: FlightData,
@@ -115,7 +96,32 @@ def _rotations(
     time_s: Sequence[float | None],
     target: AnyTarget,
 ) -> dict[int, SceneRotation]:
-    """Return by row the rotation of the scene about a target while the frame is read out."""
+    """Return by row the rotation of the scene about a target while the frame is read out.
+
+    Poses and times of the frames around show all of it but vibration. The camera's rates in the
+    times file are those of the camera alone: what its flight and the target's motion add follows
+    from poses and times, or is unknown.
+    """
+    unknown, rates = SceneRotation.unknown(flight.camera), data.scene_rotations
+    around = _rotations_around(flight, data, frames, time_s, target)
+    rotations = {row: total for row, (total, _) in around.items()}
+    for row, frame in enumerate(frames):
+        if frame in rates:
+            total, by_places = around.get(row, (None, unknown))
+            x, y, z = np.add(rates[frame].velocity_rad_s, by_places.velocity_rad_s).tolist()
+            sd_rad_s = math.hypot(rates[frame].sd_rad_s, by_places.sd_rad_s)
+            rotations[row] = more_certain(SceneRotation((x, y, z), sd_rad_s), total)
+    return rotations
+
+
+def _rotations_around(
+    flight: Flight,
+    data: FlightData,
+    frames: Sequence[str],
+    time_s: Sequence[float | None],
+    target: AnyTarget,
+) -> dict[int, tuple[SceneRotation, SceneRotation]]:
+    """Return by row the scene's rotation by the frames around, and its part by the places."""
     camera = flight.camera
     if not camera.readout_s or not data.has_reference or not data.has_position_of(target):
         return {}
@@ -142,7 +148,8 @@ def _rotations(
     if not placed:
         return {}
     at = [posed[frames[row]] for _, row, _ in placed]
-    camera_from_enu = np.swapaxes(orientations.enu_from_camera[at], 1, 2)
+    enu_from_camera = orientations.enu_from_camera[at]
+    camera_from_enu = np.swapaxes(enu_from_camera, 1, 2)
     sight_m = np.array([position.position_m for *_, position in placed]) - orientations.centre_m[at]
     enu_from_body = np.array(
         [
@@ -150,13 +157,16 @@ def _rotations(
             for *_, position in placed
         ]
     )
+    placed_s, unknown = np.array([time for time, *_ in placed]), SceneRotation.unknown(camera)
     rotations = rotations_between_frames(
-        np.array([time for time, *_ in placed]),
+        placed_s,
         np.einsum("nij,nj->ni", camera_from_enu, sight_m),
         camera_from_enu @ enu_from_body,
-        SceneRotation.unknown(camera),
+        unknown,
     )
-    return {row: rotation for (_, row, _), rotation in zip(placed, rotations, strict=True)}
+    by_places = rotations_by_places(placed_s, sight_m, enu_from_camera, enu_from_body, unknown)
+    pairs = zip(rotations, by_places, strict=True)
+    return {row: pair for (_, row, _), pair in zip(placed, pairs, strict=True)}
 
 
 def motions_while_read(
@@ -176,11 +186,12 @@ def motions_while_read(
     orientations = ExteriorOrientations.of(poses, local_frame)
     time_s = {attempt.frame: attempt.time_s for attempt in attempts}
     times = [time_s.get(frame) for frame in poses.frames]
-    unknown, rates = SceneRotation.unknown(flight.camera), data.scene_rotations
+    rates = data.scene_rotations
     return camera_motions(
         np.array([math.nan if time is None else time for time in times]),
         orientations.centre_m,
         orientations.enu_from_camera,
-        [rates.get(frame, unknown) for frame in poses.frames],
+        [rates.get(frame) for frame in poses.frames],
+        SceneRotation.unknown(flight.camera),
         float(np.median(distances_m)),
     )

@@ -15,6 +15,7 @@ from kgcp.georef.plain_neighbours import PlainTracks
 from kgcp.georef.plain_prediction import (
     FrameOrientation,
     Predictions,
+    Rotations,
     predict_marked,
     predict_places,
     predict_plain,
@@ -29,6 +30,7 @@ from kgcp.measurement.guided import Prediction
 from kgcp.measurement.plain_prediction import PredictedPlace
 from kgcp.measurement.records import FrameResult, Measurement, Miss, is_unreadable
 from kgcp.network.ground.frame_poses import orient_frames, print_scale_sd
+from kgcp.pipeline.frame_priors import Priors
 from kgcp.quality.checks.static_targets import PlainSearch
 from kgcp.targets.layout import Target
 from kgcp.targets.plain import AnyTarget
@@ -115,9 +117,14 @@ class ByReference:
 
 
 def static_by_reference(
-    flight: Flight, data: FlightData, frames: Sequence[str]
+    flight: Flight, data: FlightData, frames: Sequence[str], priors: Sequence[Priors]
 ) -> list[ByReference]:
     """Return for each frame what its reference pose predicts, if there are plain targets.
+
+    Parameters
+    ----------
+    priors : sequence of mapping
+        Of each frame.
 
     Raises
     ------
@@ -135,13 +142,18 @@ def static_by_reference(
     ]
     return [
         ByReference(
-            predict_plain(flight.plain_targets, orientations[frame], positions, camera),
-            predict_places(coded, orientations[frame], positions, camera),
+            predict_plain(flight.plain_targets, orientations[frame], positions, camera, rotations),
+            predict_places(coded, orientations[frame], positions, camera, rotations),
         )
         if frame in orientations
         else ByReference()
-        for frame in frames
+        for frame, rotations in zip(frames, map(_rotations, priors), strict=True)
     ]
+
+
+def _rotations(priors: Priors) -> Rotations:
+    """Return how the scene turns about a frame's targets while it is read, where it is known."""
+    return {name: prior.rotation for name, prior in priors.items() if prior.rotation is not None}
 
 
 def searches_by_reference(
@@ -177,11 +189,19 @@ class ContradictedMarks:
 
 
 def marks_against_reference(
-    flight: Flight, data: FlightData, marks: Mapping[str, Sequence[HandMark]]
+    flight: Flight,
+    data: FlightData,
+    marks: Mapping[str, Sequence[HandMark]],
+    priors: Mapping[str, Priors],
 ) -> ContradictedMarks | None:
     """Compare marks with the reference poses of their frames; None: none is contradicted.
 
     A mark on the predicted target is not contradicted, even if it is not at its centre.
+
+    Parameters
+    ----------
+    priors : mapping of mappings
+        By frame, for all frames with marks.
     """
     if not data.has_reference:
         return None
@@ -189,7 +209,8 @@ def marks_against_reference(
     orientations = reference_orientations(data.reference_poses, positions.local_frame)
     compared, contradicted = 0, []
     for frame in marks.keys() & orientations.keys():
-        places = predict_places(static, orientations[frame], positions, flight.camera)
+        rotations = _rotations(priors[frame])
+        places = predict_places(static, orientations[frame], positions, flight.camera, rotations)
         for mark in marks[frame]:
             predicted = places.get(mark.target)
             if predicted is None:
@@ -211,6 +232,7 @@ def plain_by_results(
     results: Iterable[FrameResult],
     time_s: FloatArray,
     marks: Mapping[str, Sequence[HandMark]],
+    priors: Sequence[Priors],
     tried: Collection[tuple[int, str]] = (),
 ) -> dict[int, Predictions]:
     """Return by row predictions of plain targets that have had no certain prediction so far.
@@ -226,6 +248,8 @@ def plain_by_results(
         Mid-exposures [s]; NaN: unknown.
     marks : mapping
         Static targets that were marked by hand, by frame.
+    priors : sequence of mapping
+        Of each frame.
     tried : collection of tuple
         Rows and targets that were already searched for with a certain prediction.
     """
@@ -251,7 +275,9 @@ def plain_by_results(
     if not lacking:
         return {}
     by_neighbours = tracks.predictions(flight.camera, lacking)
-    by_targets = _by_other_targets(flight, data, [*rows], sightings)
+    by_targets = _by_other_targets(
+        flight, data, {frame: _rotations(priors[row]) for frame, row in rows.items()}, sightings
+    )
     predictions: dict[int, Predictions] = {}
     for frame, row in rows.items():
         places = {mark.target: mark.place for mark in marks.get(frame, ())}
@@ -273,13 +299,19 @@ def plain_by_results(
 
 
 def _by_other_targets(
-    flight: Flight, data: FlightData, frames: Sequence[str], sightings: Sequence[Sighting]
+    flight: Flight,
+    data: FlightData,
+    rotations: Mapping[str, Rotations],
+    sightings: Sequence[Sighting],
 ) -> dict[str, Predictions]:
-    """Return by frame the predictions of plain targets by the pose from other static targets."""
+    """Return by frame the predictions of plain targets by the pose from other static targets.
+
+    `rotations` are those of the frames to predict for.
+    """
     predictions: dict[str, Predictions] = {}
     positions = data.static_positions
     for oriented in orient_frames(
-        frames,
+        [*rotations],
         sightings,
         positions.static,
         flight.camera,
@@ -294,7 +326,11 @@ def _by_other_targets(
                 "the frame's other targets",
             )
             predictions[oriented.frame] = predict_plain(
-                flight.plain_targets, orientation, positions, flight.camera
+                flight.plain_targets,
+                orientation,
+                positions,
+                flight.camera,
+                rotations[oriented.frame],
             )
     return predictions
 

@@ -7,18 +7,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.attitude import cross_matrix
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.plain_prediction import (
     MarkedPlace,
     predict_marked,
+    predict_places,
     predict_plain,
     reference_orientations,
 )
 from kgcp.georef.target_positions import static_position
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import read_flight
+from kgcp.measurement.plate_prior import SceneRotation
 from tests.plain_flight import CAMERA, CRS, ORIGIN_MAP, TARGETS, PlainFlight
 
 
@@ -33,7 +36,7 @@ def test_deviations_cover_the_errors_of_the_poses(made: Path) -> None:
     positions = data.static_positions
     orientations = reference_orientations(data.reference_poses, positions.local_frame)
     assert [*orientations] == ["f_0.png"]
-    named = predict_plain(flight.plain_targets, orientations["f_0.png"], positions, CAMERA)
+    named = predict_plain(flight.plain_targets, orientations["f_0.png"], positions, CAMERA, {})
     centres_m = PlainFlight(frames=1).centres_m(0)
     for target, centre_m in zip(TARGETS, centres_m, strict=True):
         one = named[target.name]
@@ -61,7 +64,7 @@ def test_poses_without_both_deviations_are_trusted_less(
         sd_angle_deg=poses.sd_angle_deg if "sd_angle_deg" in stated else None,
     )
     orientation = reference_orientations(bare, positions.local_frame)["f_0.png"]
-    named = predict_plain(flight.plain_targets, orientation, positions, CAMERA)
+    named = predict_plain(flight.plain_targets, orientation, positions, CAMERA, {})
     assert all(4.0 < one.sd_px < 6.0 for one in named.values())
 
 
@@ -70,14 +73,38 @@ def test_a_rolling_shutter_widens_predictions_away_from_the_middle_row(made: Pat
     positions = FlightData(flight, ["f_0.png"]).static_positions
     poses = FlightData(flight, ["f_0.png"]).reference_poses
     orientation = reference_orientations(poses, positions.local_frame)["f_0.png"]
-    still = predict_plain(flight.plain_targets, orientation, positions, CAMERA)
+    still = predict_plain(flight.plain_targets, orientation, positions, CAMERA, {})
     rolling = replace(CAMERA, readout_s=0.1)
-    moving = predict_plain(flight.plain_targets, orientation, positions, rolling)
+    moving = predict_plain(flight.plain_targets, orientation, positions, rolling, {})
     for name, one in still.items():
         # 5°/s until the row is exposed
         share = one.centre_px[1] / (CAMERA.height - 1) - 0.5
         turn_px = CAMERA.fx * np.radians(5.0) * 0.1 * share
-        assert moving[name].sd_px == pytest.approx(np.hypot(one.sd_px, turn_px), rel=1e-3)
+        assert moving[name].sd_px == pytest.approx(np.hypot(one.sd_px, turn_px), rel=0.06)
+
+
+def test_known_motion_moves_predictions_to_their_rows(made: Path) -> None:
+    """At 16 m/s and 28 m, the scene turns by 33°/s: 12 px in 15 ms, and many targets were lost."""
+    flight = read_flight(made)
+    data = FlightData(flight, ["f_0.png"])
+    positions = data.static_positions
+    orientation = reference_orientations(data.reference_poses, positions.local_frame)["f_0.png"]
+    rolling = replace(CAMERA, readout_s=0.1)
+    rotation = SceneRotation((np.radians(33.0), 0.0, np.radians(10.0)), np.radians(0.5))
+    known = dict.fromkeys((each.name for each in flight.plain_targets), rotation)
+    named = predict_plain(flight.plain_targets, orientation, positions, rolling, known)
+    places = predict_places(flight.plain_targets, orientation, positions, rolling, known)
+    for name, still in predict_plain(
+        flight.plain_targets, orientation, positions, CAMERA, {}
+    ).items():
+        one = named[name]
+        delay_s = float(rolling.delay_s(one.centre_px[None])[0])
+        turn = Rotation.from_rotvec(delay_s * np.array(rotation.velocity_rad_s))
+        at_row = CAMERA.project(turn.apply(still.position_m)[None])[0]
+        assert np.linalg.norm(one.centre_px - at_row) < 0.05
+        assert np.linalg.norm(one.centre_px - still.centre_px) > 3.0
+        assert one.sd_px < 1.5
+        np.testing.assert_array_equal(places[name].centre_px, one.centre_px)
 
 
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.6, 0.0, 0.8)])
@@ -108,7 +135,7 @@ def test_correlated_errors_of_a_pose_cancel_in_the_prediction(made: Path) -> Non
     about = np.vstack((cross_matrix(arm_m), np.eye(3)))
     cov = 1e-4 * about @ about.T
     made_of = [
-        predict_plain(flight.plain_targets, replace(orientation, cov=one), positions, CAMERA)
+        predict_plain(flight.plain_targets, replace(orientation, cov=one), positions, CAMERA, {})
         for one in (cov, np.diag(np.diag(cov)))
     ]
     correlated, not_correlated = (named["white"].sd_px for named in made_of)
@@ -123,7 +150,7 @@ def test_a_free_normal_is_that_of_no_plane(made: Path) -> None:
     orientation = reference_orientations(data.reference_poses, positions.local_frame)["f_0.png"]
     free = [replace(target, normal_enu=None) for target in flight.plain_targets]
     for target in free:
-        one = predict_plain(free, orientation, positions, CAMERA)[target.name]
+        one = predict_plain(free, orientation, positions, CAMERA, {})[target.name]
         assert one.normal is None
         assert not one.is_from_behind()
         along = one.position_m / np.linalg.norm(one.position_m)

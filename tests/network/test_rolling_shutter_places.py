@@ -108,8 +108,14 @@ def placed(
 
 def motions_of(flight: GroundFlight, time_s: FloatArray) -> CameraMotions:
     exterior = ExteriorOrientations.of(reference(flight), flight.local_frame)
-    unknown = [SceneRotation.unknown(CAMERA)] * FRAMES
-    return camera_motions(time_s, exterior.centre_m, exterior.enu_from_camera, unknown, HEIGHT_M)
+    return camera_motions(
+        time_s,
+        exterior.centre_m,
+        exterior.enu_from_camera,
+        [None] * FRAMES,
+        SceneRotation.unknown(CAMERA),
+        HEIGHT_M,
+    )
 
 
 def test_a_camera_that_flies_on_does_not_lift_the_targets() -> None:

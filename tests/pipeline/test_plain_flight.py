@@ -219,7 +219,8 @@ def turn_reference(folder: Path, degrees: float) -> None:
 def test_searches_by_reference_poses_are_told_from_others(tmp_path: Path) -> None:
     PlainFlight(frames=1).write(tmp_path)
     flight = read_flight(tmp_path)
-    (known,) = static_by_reference(flight, FlightData(flight, ["f_0.png"]), ["f_0.png"])
+    data = FlightData(flight, ["f_0.png"])
+    (known,) = static_by_reference(flight, data, ["f_0.png"], [{}])
     misses = Miss("white", Reason.NO_CANDIDATE), Miss("black", Reason.NO_PREDICTION)
     result = FrameResult("f_0.png", None, ExposureSettings(), misses)
     searches = searches_by_reference(result, known.plain, CAMERA)
@@ -237,7 +238,8 @@ def test_marks_that_contradict_reference_poses_are_refused(tmp_path: Path) -> No
     path.write_text("\n".join(lines), encoding="utf-8")
     flight = read_flight(tmp_path)
     marks = read_marks(path, ["f_0.png"], [each.name for each in TARGETS], CAMERA)
-    assert marks_against_reference(flight, FlightData(flight, ["f_0.png"]), marks) is None
+    data = FlightData(flight, ["f_0.png"])
+    assert marks_against_reference(flight, data, marks, {"f_0.png": {}}) is None
     turn_reference(tmp_path, 40.0)
     with pytest.raises(KgcpError, match=r"3 of 3 marks are not where .* give rough \[reference\]"):
         detect_flight(flight, options=RunOptions(jobs=0, places=path))

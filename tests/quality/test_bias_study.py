@@ -302,7 +302,8 @@ def test_reference_distances_are_those_when_a_rolling_shutter_exposes_the_target
         time_s,
         orientations.centre_m,
         orientations.enu_from_camera,
-        [SceneRotation.unknown(camera)] * count,
+        [None] * count,
+        SceneRotation.unknown(camera),
         above_m,
     )
     still, moving = (

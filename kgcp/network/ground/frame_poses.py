@@ -499,7 +499,8 @@ def _at_middle_row(
 ) -> tuple[CameraPose, FloatArray]:
     """Return pose and covariance at the middle row, from those at the row of one point."""
     rotation_vector, sd_rad = _rotation_until_row(pose, readout)
-    by_motion = np.repeat([distance_m * sd_rad, sd_rad], 3) ** 2
+    shift_m = distance_m * readout.sd_shift_rad_s * abs(float(readout.delay_s[0]))
+    by_motion = np.repeat([shift_m, sd_rad], 3) ** 2
     return pose.moved(np.array([0.0, 0.0, 0.0, *-rotation_vector])), cov + np.diag(by_motion)
 
 

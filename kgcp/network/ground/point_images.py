@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,10 +15,13 @@ from kgcp.measurement.plate_prior import SceneRotation
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Readout:
-    """Exposure times of n points by a rolling shutter, and the rotation of the scene meanwhile."""
+    """Exposure times of n points by a rolling shutter, and the camera's motion meanwhile."""
 
     delay_s: FloatArray  # (n,): after the middle row, to whose moment the pose refers
-    rotation: SceneRotation
+    rotation: SceneRotation  # of the scene, by the camera's rotation alone
+    # standard deviation of the apparent rotation of the scene, about each axis, by the camera's
+    # shift, which its rates do not show
+    sd_shift_rad_s: float
 
     @classmethod
     def of(
@@ -29,15 +32,16 @@ class Readout:
         Parameters
         ----------
         rotation : SceneRotation, optional
-            The scene's rotation if it is known; by default that of the camera's settings.
+            The scene's rotation by the camera's rates; by default that of the camera's settings.
         """
         if not camera.readout_s:
             return None
-        return cls(camera.delay_s(pixels), rotation or SceneRotation.unknown(camera))
+        unknown = SceneRotation.unknown(camera)
+        return cls(camera.delay_s(pixels), rotation or unknown, unknown.sd_rad_s)
 
     def chosen(self, which: BoolArray) -> Readout:
         """Return the readout of some of the points."""
-        return Readout(self.delay_s[which], self.rotation)
+        return replace(self, delay_s=self.delay_s[which])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +81,8 @@ class PointImages:
         if self.readout is None:
             return np.zeros(len(self))
         velocity = np.array(self.readout.rotation.velocity_rad_s)
-        speed = math.hypot(float(np.linalg.norm(velocity)), self.readout.rotation.sd_rad_s)
+        sds = self.readout.rotation.sd_rad_s, self.readout.sd_shift_rad_s
+        speed = math.hypot(float(np.linalg.norm(velocity)), max(sds))
         return np.asarray(speed * np.abs(self.readout.delay_s))
 
     @property

@@ -63,8 +63,10 @@ def _linearised(camera: Camera, images: PointImages, pose: CameraPose) -> _Linea
         parts.append(by_motion)
         rotation = images.readout.rotation
         sight_m = np.linalg.norm(images.positions_m - pose.centre_m, axis=1)
-        sd_rad_s = max(rotation.sd_rad_s, _MIN_MOTION_SD_RAD_S)
-        sds += [sd_rad_s * float(sight_m.mean())] * 3 + [sd_rad_s] * 3
+        sd_shift_m_s = float(sight_m.mean()) * images.readout.sd_shift_rad_s
+        least_m_s = float(sight_m.mean()) * _MIN_MOTION_SD_RAD_S
+        sds += [max(sd_shift_m_s, least_m_s)] * 3
+        sds += [max(rotation.sd_rad_s, _MIN_MOTION_SD_RAD_S)] * 3
         # the camera rotates opposite to the scene
         camera_rad_s = -pose.world_from_camera @ np.array(rotation.velocity_rad_s)
         residuals = residuals - by_motion[:, :, 3:] @ camera_rad_s
