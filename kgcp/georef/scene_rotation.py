@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.measurement.plate_prior import SceneRotation
 
 _MAX_COMPARED = 8  # nearest frames from which the uncertainty of a rotation is estimated
 _MIN_COMPARED = 4  # least number of such frames in a flight
+_MAX_UNLIKE = 0.5  # RMS difference of rates that predict each other, relative to their own RMS
 _MAX_INTERVALS = 1.5  # to the neighbour of the first frame or the last, in usual intervals
 # Vibration that is too fast for frames to show, as shares of the a-priori standard deviations of
 # rotation and velocity. It turns a camera far more than it shifts it: at 5°/s and 30 m, the share
@@ -38,6 +40,35 @@ class CameraMotions:
     # (n,): whether poses before and after determine the motion; otherwise it is the a-priori one,
     # whose error all frames share
     is_observed: BoolArray
+
+    def after(
+        self, orientations: ExteriorOrientations, rows: Sequence[int], delay_s: FloatArray
+    ) -> ExteriorOrientations:
+        """Return n orientations as they are some time after those of the poses.
+
+        The covariances include that of the motion.
+
+        Parameters
+        ----------
+        orientations : ExteriorOrientations
+            Of all frames.
+        rows : sequence of int
+            Which of them, n times.
+        delay_s : (n,) array
+            Time after each.
+        """
+        at = [*rows]
+        shift_m = delay_s[:, None] * self.velocity_m_s[at]
+        turns = Rotation.from_rotvec(delay_s[:, None] * self.turn_rad_s[at]).as_matrix()
+        cov = np.zeros((len(at), 6, 6))
+        cov[:, range(3), range(3)] = ((delay_s * self.sd_velocity_m_s[at]) ** 2)[:, None]
+        cov[:, range(3, 6), range(3, 6)] = ((delay_s * self.sd_turn_rad_s[at]) ** 2)[:, None]
+        return replace(
+            orientations,
+            centre_m=orientations.centre_m[at] + shift_m,
+            enu_from_camera=turns @ orientations.enu_from_camera[at],
+            cov=cov if orientations.cov is None else orientations.cov[at] + cov,
+        )
 
 
 def more_certain(by_rates: SceneRotation, by_frames: SceneRotation | None) -> SceneRotation:
@@ -196,8 +227,9 @@ def _posterior(
     if len(compared) < _MIN_COMPARED:
         return rates, sds
     off2 = np.mean((near - wide)[compared] ** 2, axis=1)
-    shown2 = float(np.mean(near[compared] ** 2) - off2.mean())
-    sds = np.maximum(sds, math.sqrt(max(0.0, shown2)))
+    usual2 = float(np.mean(near[compared] ** 2))
+    if off2.mean() < _MAX_UNLIKE**2 * usual2:
+        sds = np.maximum(sds, math.sqrt(usual2))
     inner = np.flatnonzero(is_near)
     changes2 = np.mean(np.diff(near[compared], axis=0) ** 2, axis=1)
     usual_s = float(np.median(np.diff(time_s[inner])))

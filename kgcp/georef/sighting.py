@@ -59,7 +59,11 @@ class Sighting:
         """
         if self.time_s is None:
             return None
-        return self.time_s + self.rows_since_middle(camera) * camera.readout_s
+        return self.time_s + self.delay_s(camera)
+
+    def delay_s(self, camera: Camera) -> float:
+        """Return how much later than the middle row the centre's row was exposed [s]."""
+        return self.rows_since_middle(camera) * camera.readout_s
 
     def rows_since_middle(self, camera: Camera) -> float:
         """Return how far below the middle row the centre is, in frame heights; inside ±0.5."""
@@ -134,3 +138,8 @@ class Attempt:
     time_s: float | None  # mid-exposure, Unix UTC [s]
     sighting: Sighting | None  # None where the target was not measured
     exposure: Exposure
+
+
+def known_times_s(attempts: Sequence[Attempt]) -> dict[str, float]:
+    """Return the mid-exposures of frames [s]; those without a time are left out."""
+    return {each.frame: each.time_s for each in attempts if each.time_s is not None}

@@ -35,7 +35,6 @@ from kgcp.pipeline.exclude import FrameAndTarget, without_excluded
 from kgcp.pipeline.execution.signals import defer_interrupts
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.flight_inputs import FlightInputs, naming_causes
-from kgcp.pipeline.frame_priors import motions_while_read
 from kgcp.pipeline.workspace import DETECTIONS, require_outside_frames, results_folder
 from kgcp.quality.advice import agrees
 from kgcp.quality.bias_study import BiasStudy, study_bias
@@ -241,6 +240,7 @@ def bias_study(
     settings = read_settings(table)
     data = FlightData(flight, [attempt.frame for attempt in attempts])
     inputs = FlightInputs.detected(flight, data, attempts)
+    sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
     with naming_causes(inputs.plausibility):
         poses, positions = data.reference_poses, data.target_positions
         study = study_bias(
@@ -250,9 +250,8 @@ def bias_study(
             flight.camera,
             flight.all_targets,
             settings.method,
-            motions_while_read(flight, data, poses, positions.local_frame, attempts),
+            inputs.motions(sightings),
         )
-    sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
     consistency, doubts = inputs.compared(sightings)
     choices = {"excluded": pairs} if pairs else {}
     provenance = derived_provenance(flight, table, choices, has_reference=True)

@@ -17,7 +17,8 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.georef.crs import longitude_latitude
 from kgcp.georef.prediction import reference_states
-from kgcp.georef.sighting import Attempt, Sighting
+from kgcp.georef.scene_rotation import CameraMotions
+from kgcp.georef.sighting import Attempt, Sighting, known_times_s
 from kgcp.georef.target_positions import TargetPositions
 from kgcp.georef.trajectory import Trajectory
 from kgcp.io.files.safe_read import is_missing
@@ -29,6 +30,7 @@ from kgcp.io.images.frames import list_frames
 from kgcp.io.images.remote import StoredFolder, at_hand
 from kgcp.io.tables.provenance import TARGET_TABLE
 from kgcp.io.tables.staleness import changed_since_orient, listed_changes
+from kgcp.pipeline.frame_priors import motions_while_read
 from kgcp.quality.checks.calibration import check_camera
 from kgcp.quality.checks.camera_position import check_camera_position
 from kgcp.quality.checks.clock import (
@@ -140,11 +142,8 @@ class FlightInputs:
     ) -> FlightInputs:
         """Take frames and times from detections, and read some headers."""
         frames = sorted({attempt.frame for attempt in attempts})
-        times_s = {
-            attempt.frame: attempt.time_s for attempt in attempts if attempt.time_s is not None
-        }
         headers = read_headers(flight, frames, max_headers=SAMPLED_FRAMES)
-        return cls(flight, data, tuple(frames), headers, times_s)
+        return cls(flight, data, tuple(frames), headers, known_times_s(attempts))
 
     @cached_property
     def problems(self) -> list[Doubt]:
@@ -289,9 +288,10 @@ class FlightInputs:
         data, camera = self.data, self.flight.camera
         positions = data.target_positions
         poses = data.reference_poses if data.has_reference else None
-        agreement = None
+        agreement = motions = None
         if poses is not None:
-            agreement = study_consistency(sightings, positions, poses, camera)
+            motions = self.motions(sightings)
+            agreement = study_consistency(sightings, positions, poses, camera, motions)
         doubts = measured_doubts(
             self.plausibility,
             sightings,
@@ -301,8 +301,21 @@ class FlightInputs:
             self.headers,
             agreement,
             self.flight.all_targets,
+            motions,
         )
         return agreement, doubts
+
+    def motions(self, sightings: Sequence[Sighting]) -> CameraMotions | None:
+        """Return how the camera moves while a rolling shutter reads frames, as the poses show.
+
+        Raises
+        ------
+        KgcpError
+            If the poses or the target's positions cannot be read.
+        """
+        data = self.data
+        poses, local_frame = data.reference_poses, data.target_positions.local_frame
+        return motions_while_read(self.flight, data, poses, local_frame, self.times_s, sightings)
 
     def _doubts_of_places(self) -> list[Doubt]:
         crs = self.flight.crs

@@ -20,7 +20,7 @@ from kgcp.georef.scene_rotation import (
     rotations_between_frames,
     rotations_by_places,
 )
-from kgcp.georef.sighting import Attempt
+from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition, Vehicle
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
@@ -174,24 +174,27 @@ def motions_while_read(
     data: FlightData,
     poses: ReferencePoses,
     local_frame: LocalFrame,
-    attempts: Sequence[Attempt],
+    time_s: Mapping[str, float],
+    sightings: Sequence[Sighting],
 ) -> CameraMotions | None:
     """Return the motion of the camera while frames are read out, in the order of their poses.
 
     None: there is no rolling shutter, or nothing was measured.
+
+    Parameters
+    ----------
+    time_s : mapping
+        Times of frames [s]: those of the detections.
     """
-    distances_m = [attempt.sighting.distance_m for attempt in attempts if attempt.sighting]
-    if not flight.camera.readout_s or not distances_m:
+    if not flight.camera.readout_s or not sightings:
         return None
     orientations = ExteriorOrientations.of(poses, local_frame)
-    time_s = {attempt.frame: attempt.time_s for attempt in attempts}
-    times = [time_s.get(frame) for frame in poses.frames]
     rates = data.scene_rotations
     return camera_motions(
-        np.array([math.nan if time is None else time for time in times]),
+        np.array([time_s.get(frame, math.nan) for frame in poses.frames]),
         orientations.centre_m,
         orientations.enu_from_camera,
         [rates.get(frame) for frame in poses.frames],
         SceneRotation.unknown(flight.camera),
-        float(np.median(distances_m)),
+        float(np.median([sighting.distance_m for sighting in sightings])),
     )

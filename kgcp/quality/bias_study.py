@@ -223,18 +223,22 @@ def _camera_places(
 ) -> list[_CameraPlace]:
     """Return the camera's pose when the target's row of each attempt was exposed."""
     row_of = {frame: row for row, frame in enumerate(poses.frames)}
-    places = []
-    for attempt in attempts:
-        row = row_of[attempt.frame]
-        centre = orientations.centre_m[row]
-        cov = None if orientations.cov_m2 is None else orientations.cov_m2[row]
-        if motions is not None and attempt.sighting is not None:
-            delay_s = attempt.sighting.rows_since_middle(camera) * camera.readout_s
-            centre = centre + delay_s * motions.velocity_m_s[row]
-            moved_sd_m = delay_s * motions.sd_velocity_m_s[row]
-            cov = None if cov is None else cov + moved_sd_m**2 * np.eye(3)
-        places.append(_CameraPlace(centre, orientations.enu_from_camera[row], cov))
-    return places
+    rows = [row_of[attempt.frame] for attempt in attempts]
+    delays_s = [
+        0.0 if each.sighting is None else each.sighting.delay_s(camera) for each in attempts
+    ]
+    if motions is not None:
+        orientations = motions.after(orientations, rows, np.array(delays_s))
+        rows = [*range(len(attempts))]
+    covs = orientations.cov_m2
+    return [
+        _CameraPlace(
+            orientations.centre_m[row],
+            orientations.enu_from_camera[row],
+            None if covs is None else covs[row],
+        )
+        for row in rows
+    ]
 
 
 def _compare_all(

@@ -13,6 +13,7 @@ from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.camera import Camera
 from kgcp.georef.exterior_orientation import ExteriorOrientations
+from kgcp.georef.scene_rotation import CameraMotions
 from kgcp.georef.sighting import Sighting, unmistakable
 from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.quality.consistency_equations import ComparedFrame, ConsistencyEquations
@@ -64,17 +65,20 @@ def study_consistency(
     target_positions: TargetPositions,
     poses: ReferencePoses,
     camera: Camera,
+    motions: CameraMotions | None = None,
 ) -> Consistency | None:
     """Compare the target's positions by the vehicle with those by the camera.
 
     The first follow from trajectory and lever arm. The others follow from the reference pose of the
     camera and the measured pose of the target, P = C + R(ENU ← camera) t. With a rolling shutter, C
-    includes the camera's motion until the target's row is exposed.
+    and R include the camera's motion until the target's row is exposed.
 
     Parameters
     ----------
     sightings : sequence of Sighting
         Those of static targets, and those without a pose or a reference pose, are not used.
+    motions : CameraMotions, optional
+        For a rolling shutter: motion of the camera at each reference pose.
 
     Returns
     -------
@@ -91,7 +95,7 @@ def study_consistency(
         return None
     orientations = ExteriorOrientations.of(poses, target_positions.local_frame)
     equations = ConsistencyEquations.of(
-        frames, orientations, camera, target_positions.vehicle.settings.sd_time_s
+        frames, orientations, camera, target_positions.vehicle.settings.sd_time_s, motions
     )
     outlier = find_outliers(
         -equations.design,

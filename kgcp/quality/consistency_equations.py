@@ -14,8 +14,10 @@ from kgcp.geometry.attitude import cross_matrix, place_covariances
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.georef.exterior_orientation import ExteriorOrientations
+from kgcp.georef.scene_rotation import CameraMotions, camera_motions
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition, VehicleState
+from kgcp.measurement.plate_prior import SceneRotation
 
 _MODEL_SD_M = 0.001  # of interpolation and rounding; keeps covariances regular
 _UNSTATED_SD_M = 0.01  # of data without standard deviations; the residuals then set the scale
@@ -61,24 +63,39 @@ class ConsistencyEquations:
         orientations: ExteriorOrientations,
         camera: Camera,
         sd_time_s: float,
+        motions: CameraMotions | None = None,
     ) -> Self:
-        """Set up the equations of frames in the order of time."""
+        """Set up the equations of frames in the order of time.
+
+        `motions` are those of a rolling shutter's camera at each pose; None: all rows are exposed
+        at once.
+        """
         rows = [frame.row for frame in frames]
+        velocity = np.array([frame.vehicle_state.velocity_m_s for frame in frames])
+        if motions is None:
+            centres, axes = orientations.centre_m[rows], orientations.enu_from_camera[rows]
+            camera_velocity = _camera_velocity(frames, centres, velocity)
+            camera_turn = _own_motions(frames, centres, axes, camera).turn_rad_s
+        else:
+            camera_velocity, camera_turn = motions.velocity_m_s[rows], motions.turn_rad_s[rows]
+            delays_s = np.array([frame.sighting.delay_s(camera) for frame in frames])
+            orientations = motions.after(orientations, rows, delays_s)
+            rows = [*range(len(frames))]
         attitude = orientations.enu_from_camera[rows]
         in_camera = np.array([frame.pose.translation_m for frame in frames])
         sight = np.einsum("nij,nj->ni", attitude, in_camera)
-        velocity = np.array([frame.vehicle_state.velocity_m_s for frame in frames])
         body = np.array([frame.vehicle_state.frame_from_body for frame in frames])
         since_middle = np.array([frame.sighting.rows_since_middle(camera) for frame in frames])[
             :, None
         ]
-        camera_velocity = _camera_velocity(frames, orientations.centre_m[rows], velocity)
-        centre = orientations.centre_m[rows] + camera_velocity * since_middle * camera.readout_s
+        centre = orientations.centre_m[rows]
         offset = np.array([frame.position.position_m for frame in frames]) - centre - sight
         columns = (
             velocity[:, :, None],
             body,
-            (since_middle * (velocity - camera_velocity))[:, :, None],
+            (since_middle * (velocity - camera_velocity - np.cross(camera_turn, sight)))[
+                :, :, None
+            ],
         )
         # The radius in the image gives the depth; pixel and depth give the rest. So a correction
         # of the diameter scales the whole translation, and one of the focal length the depth only.
@@ -93,7 +110,7 @@ class ConsistencyEquations:
             axis=2,
         )
         correlated = np.array([_correlated_m2(frame.position) for frame in frames])
-        independent = _independent_m2(frames, orientations, sight)
+        independent = _independent_m2(frames, orientations, rows, sight)
         shift = sd_time_s * velocity
         independent = independent + shift[:, :, None] * shift[:, None, :]
         independent = independent + np.array(
@@ -133,11 +150,11 @@ def _interpolation_m2(position: TargetPosition) -> FloatArray:
 def _independent_m2(
     frames: Sequence[ComparedFrame],
     orientations: ExteriorOrientations,
+    rows: Sequence[int],
     sight: FloatArray,
 ) -> FloatArray:
     """Return the covariance (n, 3, 3) of reference poses and measured poses, in ENU axes."""
-    rows = [frame.row for frame in frames]
-    attitude = orientations.enu_from_camera[rows]
+    attitude = orientations.enu_from_camera[[*rows]]
     total = np.broadcast_to(_MODEL_SD_M**2 * np.eye(3), attitude.shape)
     measured = [frame.sighting.pose_cov for frame in frames]
     of_pose = np.array([np.zeros((3, 3)) if cov is None else cov[:3, :3] for cov in measured])
@@ -206,6 +223,21 @@ def _camera_velocity(
         if len(run) > 1 and np.all(np.diff(time_s[run]) > 0.0):
             velocity[run] = CubicSpline(time_s[run], centre[run])(time_s[run], 1)
     return velocity
+
+
+def _own_motions(
+    frames: Sequence[ComparedFrame], centre: FloatArray, axes: FloatArray, camera: Camera
+) -> CameraMotions:
+    """Return the camera's motion as these frames show it."""
+    distances_m = [frame.sighting.distance_m for frame in frames]
+    return camera_motions(
+        np.array([frame.time_s for frame in frames]),
+        centre,
+        axes,
+        [None] * len(frames),
+        SceneRotation.unknown(camera),
+        float(np.median(distances_m)),
+    )
 
 
 def _track(velocity: FloatArray, body: FloatArray) -> FloatArray:

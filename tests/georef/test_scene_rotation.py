@@ -9,7 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.scene_rotation import (
+    CameraMotions,
     camera_motions,
     more_certain,
     rotations_between_frames,
@@ -138,3 +140,23 @@ def test_velocity_and_rotation_of_a_camera_follow_from_its_poses() -> None:
             turn = -enu_from_camera[place] @ rate.velocity_rad_s
             assert motions.turn_rad_s[row] == pytest.approx(turn)
             assert motions.sd_turn_rad_s[row] == rate.sd_rad_s
+
+
+def test_orientations_move_on_until_a_row() -> None:
+    motions = CameraMotions(
+        np.array([[8.0, 0.0, 1.0]]),
+        np.array([0.2]),
+        np.array([[0.0, 0.0, 0.5]]),
+        np.array([0.02]),
+        np.array([True]),
+    )
+    poses = ExteriorOrientations(
+        np.zeros((1, 3)), np.eye(3)[None], None, states_centres=False, states_angles=False
+    )
+    moved = motions.after(poses, [0, 0], np.array([0.01, -0.01]))
+    np.testing.assert_allclose(moved.centre_m, [[0.08, 0.0, 0.01], [-0.08, 0.0, -0.01]])
+    turned = Rotation.from_matrix(moved.enu_from_camera).as_rotvec()
+    np.testing.assert_allclose(turned[:, 2], [0.005, -0.005], rtol=1e-6)
+    assert moved.cov is not None
+    sds = np.sqrt(np.diagonal(moved.cov, axis1=1, axis2=2))
+    np.testing.assert_allclose(sds, [[0.002] * 3 + [0.0002] * 3] * 2)

@@ -66,7 +66,8 @@ INJECTIONS = (
     ),
     Injection(
         "[camera]\n",
-        "[camera]\nreadout_s = 0.03\n",
+        # in no two frames is this camera near the same place: its motion is what is stated here
+        "[camera]\nreadout_s = 0.03\nmotion_sd_deg_s = 0.1\n",
         "readout_s",
         -0.03,
         "[camera] readout_s",

@@ -13,10 +13,13 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, ReferencePoses, opk_from_rotation
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
+from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.local_frame import LocalFrame
+from kgcp.georef.scene_rotation import CameraMotions, camera_motions
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPositions
 from kgcp.georef.trajectory import ENU_FROM_NED, Trajectory, body_to_ned
+from kgcp.measurement.plate_prior import SceneRotation
 from kgcp.quality.advice import advice, corrections, is_explained
 from kgcp.quality.checks.causes import causes_of
 from kgcp.quality.checks.doubt import Cause, Doubt, mild
@@ -83,34 +86,52 @@ class Flight:
         above = np.column_stack((0.0 * height, 0.0 * height, height))
         return self.vehicle(time_s)[0] + 9.0 * sway + above
 
-    def study(self, camera: Camera = _CAMERA) -> Consistency:
-        found = self.study_if_enough(camera)
+    def spin(self, time_s: FloatArray) -> FloatArray:
+        """Axes of the camera (n, 3, 3) in ENU, as columns: it looks down and sways."""
+        yaw_deg, tilt_deg = 40.0 * np.sin(0.1 * time_s), 180.0 + 4.0 * np.sin(0.7 * time_s)
+        turns = np.column_stack((yaw_deg, tilt_deg))
+        return np.asarray(Rotation.from_euler("ZX", turns, degrees=True).as_matrix())
+
+    def study(self) -> Consistency:
+        found = self.study_if_enough()
         assert found is not None
         return found
 
-    def study_if_enough(self, camera: Camera = _CAMERA) -> Consistency | None:
-        return study_consistency(*self.inputs(), camera)
+    def study_if_enough(self) -> Consistency | None:
+        return study_consistency(*self.inputs(), _CAMERA)
 
     def causes(self) -> tuple[Doubt, ...]:
         encounters = Encounters.of(*self.inputs(), _CAMERA)
         assert encounters is not None
         return causes_of(encounters)
 
+    def motions(self) -> CameraMotions:
+        """As the reference poses show them."""
+        sightings, positions, poses = self.inputs()
+        exterior = ExteriorOrientations.of(poses, positions.local_frame)
+        return camera_motions(
+            np.array([one.time_s for one in sightings]),
+            exterior.centre_m,
+            exterior.enu_from_camera,
+            [None] * self.frames,
+            SceneRotation.unknown(_CAMERA),
+            60.0,
+        )
+
     def inputs(self) -> tuple[list[Sighting], TargetPositions, ReferencePoses]:
         rng = np.random.default_rng(self.seed)
         time_s = _LEAD_S + 1.5 * np.arange(self.frames, dtype=np.float64)
         names = tuple(f"f{index:04d}.jpg" for index in range(self.frames))
-        yaw_deg, tilt_deg = 40.0 * np.sin(0.1 * time_s), 180.0 + 4.0 * np.sin(0.7 * time_s)
-        turns = np.column_stack((yaw_deg, tilt_deg))
-        spin = Rotation.from_euler("ZX", turns, degrees=True).as_matrix()
-        pixels, translations = self._seen(time_s, spin, rng)
+        pixels, translations = self._seen(time_s, rng)
         translations *= self.stated_diameter * np.array([1.0, 1.0, self.stated_focal_length])
         translations[list(self.wrong)] += [0.6, -0.3, 0.8]
         sightings = [
             _sighting(index, names[index], t, pixels[index], translations[index])
             for index, t in enumerate(time_s)
         ]
-        poses = _reference(names, self.drone(time_s), spin @ _turns(self.boresight_rad), rng)
+        poses = _reference(
+            names, self.drone(time_s), self.spin(time_s) @ _turns(self.boresight_rad), rng
+        )
         trajectory = self._trajectory(rng)
         if not self.has_sds:
             trajectory = replace(trajectory, sd_position_m=None)
@@ -123,14 +144,12 @@ class Flight:
         ]
         return late, target_positions, poses
 
-    def _seen(
-        self, time_s: FloatArray, enu_from_camera: FloatArray, rng: np.random.Generator
-    ) -> tuple[FloatArray, FloatArray]:
+    def _seen(self, time_s: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Pixels (n, 2) and measured translations (n, 3) of the target, row by row in time."""
         row_s = time_s
         for _ in range(5):
             sight = self.target(row_s) - self.drone(row_s)
-            translation = np.einsum("nji,nj->ni", enu_from_camera, sight)
+            translation = np.einsum("nji,nj->ni", self.spin(row_s), sight)
             pixel = _CAMERA.project(translation)
             row_s = time_s + (pixel[:, 1] / (_CAMERA.height - 1) - 0.5) * self.readout_s
         distance = np.linalg.norm(translation, axis=1)
@@ -349,8 +368,23 @@ def test_a_wrong_sign_of_a_lever_arm_is_distinguished_from_a_wrong_length() -> N
 
 
 def test_a_known_readout_is_taken_into_account() -> None:
-    found = Flight(readout_s=0.03, seed=2).study(replace(_CAMERA, readout_s=0.03))
+    """The camera moves and turns until the target's row: 7 cm and 0.07° in this flight."""
+    flight, rolling = Flight(readout_s=0.03, seed=2), replace(_CAMERA, readout_s=0.03)
+    inputs, motions = flight.inputs(), flight.motions()
+    found = study_consistency(*inputs, rolling, motions)
+    assert found is not None
     assert advised(found) == ()
+    deviations = np.array(
+        [one.offset_m / np.sqrt(np.diag(one.cov_m2)) for one in found.discrepancies]
+    )
+    assert 0.7 < np.sqrt(np.mean(deviations**2)) < 1.3
+    # a camera that stands still until then was put 0.2 m from its vehicle
+    still, moving = (Encounters.of(*inputs, rolling, known) for known in (None, motions))
+    assert still is not None
+    assert moving is not None
+    assert causes_of(moving) == ()
+    assert moving.misfit < 1.5
+    assert still.misfit > 3.0
 
 
 def test_offsets_are_along_and_across_the_track() -> None:

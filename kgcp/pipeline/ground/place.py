@@ -15,7 +15,7 @@ from kgcp.georef.crs import is_geographic
 from kgcp.georef.gcp import Gcp, build_gcps
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.scene_rotation import CameraMotions
-from kgcp.georef.sighting import Sighting
+from kgcp.georef.sighting import Sighting, known_times_s
 from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.io.exporters.points import MapPoints
 from kgcp.io.files.atomic import write_all
@@ -191,7 +191,8 @@ def place_flight(
     poses = _poses(flight, data, options.poses, [attempt.frame for attempt in attempts])
     local_frame = _local_frame(flight, poses)
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
-    motions = motions_while_read(flight, data, poses, local_frame, attempts)
+    times_s = known_times_s(attempts)
+    motions = motions_while_read(flight, data, poses, local_frame, times_s, sightings)
     with np.errstate(all="ignore"):  # trial circles may be absurd; what is not finite is rejected
         placement = place_targets(
             sightings,

@@ -15,6 +15,7 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.camera import Camera
 from kgcp.georef.exterior_orientation import ExteriorOrientations
+from kgcp.georef.scene_rotation import CameraMotions
 from kgcp.georef.sighting import Sighting, unmistakable
 from kgcp.georef.target_positions import TargetPositions, Vehicle
 from kgcp.georef.trajectory import (
@@ -63,8 +64,15 @@ class Encounters:
         target_positions: TargetPositions,
         poses: ReferencePoses,
         camera: Camera,
+        motions: CameraMotions | None = None,
     ) -> Encounters | None:
-        """Collect the frames, a selection if there are many; None if there are too few."""
+        """Collect the frames, a selection if there are many; None if there are too few.
+
+        Parameters
+        ----------
+        motions : CameraMotions, optional
+            For a rolling shutter: motion of the camera at each reference pose.
+        """
         vehicle = target_positions.vehicle
         rows = {frame: row for row, frame in enumerate(poses.frames)}
         posed = [
@@ -82,6 +90,10 @@ class Encounters:
         row_times_s, used, plate_poses, rows_of_poses = zip(*posed, strict=True)
         row = [*rows_of_poses]
         orientations = ExteriorOrientations.of(poses, target_positions.local_frame)
+        opk_deg = poses.opk_deg[row]
+        if motions is not None:
+            delays_s = np.array([sighting.delay_s(camera) for sighting in used])
+            orientations, row = motions.after(orientations, row, delays_s), [*range(len(used))]
         enu_from_camera = orientations.enu_from_camera[row]
         in_camera_m = np.array([pose.translation_m for pose in plate_poses])
         sight_m = np.einsum("nij,nj->ni", enu_from_camera, in_camera_m)
@@ -99,7 +111,7 @@ class Encounters:
             camera_from_plate=np.array([pose.rotation for pose in plate_poses]),
             centre_m=orientations.centre_m[row],
             enu_from_camera=enu_from_camera,
-            opk_deg=poses.opk_deg[row],
+            opk_deg=opk_deg,
             variance_m2=_variance_m2(used, vehicle, by_poses_m2, time_s),
             frame_from_ned=np.broadcast_to(ENU_FROM_NED, (len(row), 3, 3)),
         )

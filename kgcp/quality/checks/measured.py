@@ -8,6 +8,7 @@ import numpy as np
 
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.camera import Camera
+from kgcp.georef.scene_rotation import CameraMotions
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPositions
 from kgcp.quality.advice import corrections, is_explained
@@ -44,6 +45,7 @@ def measured_doubts(
     headers: Sequence[FrameHeader],
     consistency: Consistency | None,
     targets: Sequence[AnyTarget],
+    motions: CameraMotions | None = None,
 ) -> tuple[Doubt, ...]:
     """Return all doubts, grave ones first: those from before measuring and those from measurements.
 
@@ -57,6 +59,8 @@ def measured_doubts(
         From the same sightings and poses.
     targets : sequence of AnyTarget
         All targets of the flight.
+    motions : CameraMotions, optional
+        For a rolling shutter: motion of the camera at each reference pose.
     """
     static = target_positions.static
     of_static = [*check_static_targets(sightings, static, camera)]
@@ -64,7 +68,9 @@ def measured_doubts(
         of_static += (
             check_vehicle(sightings, target_positions, camera)
             if poses is None
-            else check_places(sightings, static, poses, camera, target_positions.local_frame)
+            else check_places(
+                sightings, static, poses, camera, target_positions.local_frame, motions
+            )
         )
     prints = [
         SeenPrint(each.target, each.distance_m, each.inner_growth, each.dots_growth)
@@ -76,7 +82,7 @@ def measured_doubts(
     if not any(doubt.is_grave for doubt in plausibility):
         encounters = None
         if poses is not None:
-            encounters = Encounters.of(sightings, target_positions, poses, camera)
+            encounters = Encounters.of(sightings, target_positions, poses, camera, motions)
         if encounters is None:
             doubts += check_camera_beside_vehicle(sightings, headers, target_positions)
         else:

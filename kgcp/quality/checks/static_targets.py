@@ -18,6 +18,7 @@ from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.camera import Camera
 from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.local_frame import LocalFrame
+from kgcp.georef.scene_rotation import CameraMotions
 from kgcp.georef.sighting import CAMERA_SPEED_M_S, Sighting, unmistakable
 from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
@@ -231,6 +232,7 @@ def check_places(
     poses: ReferencePoses,
     camera: Camera,
     local_frame: LocalFrame,
+    motions: CameraMotions | None = None,
 ) -> Iterator[Doubt]:
     """Compare the places of static targets by reference poses with their positions.
 
@@ -238,14 +240,27 @@ def check_places(
     ----------
     positions : mapping of str to TargetPosition
         Positions of the static targets in the ENU frame `local_frame`.
+    motions : CameraMotions, optional
+        For a rolling shutter: motion of the camera at each reference pose.
     """
     rows = {frame: row for row, frame in enumerate(poses.frames)}
+    used = [
+        each
+        for each in unmistakable(sightings)
+        if each.target in positions and each.pose is not None and each.frame in rows
+    ]
+    if not used:
+        return
+    at = [rows[each.frame] for each in used]
     orientations = ExteriorOrientations.of(poses, local_frame)
+    if motions is not None:
+        delays_s = np.array([each.delay_s(camera) for each in used])
+        orientations, at = motions.after(orientations, at, delays_s), [*range(len(used))]
     offsets_m: dict[str, list[FloatArray]] = defaultdict(list)
     covs_m2: dict[str, list[FloatArray]] = defaultdict(list)
-    for each in unmistakable(sightings):
-        if each.target in positions and each.pose is not None and each.frame in rows:
-            row, place = rows[each.frame], positions[each.target]
+    for each, row in zip(used, at, strict=True):
+        if each.pose is not None:
+            place = positions[each.target]
             axes = orientations.enu_from_camera[row]
             sight_m = axes @ each.pose.translation_m
             offsets_m[each.target].append(orientations.centre_m[row] + sight_m - place.position_m)
@@ -289,9 +304,7 @@ def _place_cov(
         cov = cov + orientations.place_covariances([row], sight_m[None])[0]
     else:
         sd_px = _UNSTATED_POSE_SD_PX
-    rows = sighting.rows_since_middle(camera)
-    shift_m = CAMERA_SPEED_M_S * camera.readout_s * rows
-    variance = _OTHER_SD_M**2 + (sd_px * distance_m / camera.mean_focal_px) ** 2 + shift_m**2
+    variance = _OTHER_SD_M**2 + (sd_px * distance_m / camera.mean_focal_px) ** 2
     return np.asarray(cov + variance * np.eye(3))
 
 
