@@ -65,7 +65,8 @@ class Camera:
     response : Response
         How grey values depend on light.
     readout_s : float
-        Rolling shutter: time from the first to the last row [s]; 0 for a global shutter.
+        Rolling shutter: time from the first to the last row [s]; negative if the last row is read
+        first, 0 for a global shutter.
     motion_sd_deg_s : float
         Standard deviation of the scene's rate of rotation about each camera axis [deg/s]. Used with
         a rolling shutter where the rotation is not known.
@@ -177,7 +178,7 @@ class Camera:
             value = getattr(self, key)
             if not isinstance(value, Real) or not math.isfinite(value):
                 raise SettingError(key, "is not a finite number", "give a number or leave it out")
-        require_range("readout_s", self.readout_s, 0.0, 10.0, unit="s")
+        require_range("readout_s", self.readout_s, -10.0, 10.0, unit="s")
         for key, words in (("response", Response), ("time_reference", TimeReference)):
             object.__setattr__(self, key, require_word(key, getattr(self, key), words))
         require_range("motion_sd_deg_s", self.motion_sd_deg_s, 0.0, 1000.0, unit="deg/s")

@@ -167,7 +167,7 @@ def noise_sentence(placement: Placement) -> str:
             (
                 noise.centre_px,
                 noise.centre_chance,
-                "the places (by the reference poses or the calibration)",
+                "the places (by the reference poses, the calibration or a wrong readout_s)",
             ),
             (noise.outline_px, noise.outline_chance, "size and shape"),
         )

@@ -149,7 +149,10 @@ def test_a_wrong_focal_length_is_a_doubt_about_all_diameters(tmp_path: Path) -> 
     flight = GroundFlight(stated_camera=replace(CAMERA, fx=2316.0, fy=2316.0), frames=6)
     result = run(flight.write(tmp_path / "flight"))
     assert "doubt: all 4 targets measure 6.6 ‰ smaller than stated: unless" in result.stderr
-    assert "px in the places (by the reference poses or the calibration)" in result.stderr
+    assert (
+        "px in the places (by the reference poses, the calibration or a wrong readout_s)"
+        in result.stderr
+    )
     assert "but no error that all frames share" in result.stderr
 
 

@@ -194,9 +194,18 @@ def test_a_binned_camera_has_the_same_rays_and_delays(count: int) -> None:
 @pytest.mark.parametrize(
     ("key", "value"),
     [("fx", 0.0), ("fy", -1.0), ("width", 1), ("cx", 5000.0), ("cy", float("nan")),
-     ("k2", float("inf")), ("readout_s", -0.01)],
+     ("k2", float("inf")), ("readout_s", -30.0)],
 )  # fmt: skip
 def test_invalid_cameras_are_rejected_naming_the_key(key: str, value: float) -> None:
     with pytest.raises(SettingError) as caught:
         Camera(**{**asdict(PLAIN), key: value})
     assert caught.value.key == key
+
+
+def test_rows_may_be_read_from_the_last_to_the_first() -> None:
+    """Frames of a camera that hangs upside down are often turned by 180°."""
+    camera = Camera(1600, 1201, 1700.0, 1700.0, 799.5, 600.0, readout_s=-0.03)
+    np.testing.assert_allclose(
+        camera.delay_s(np.array([[0.0, 0.0], [0.0, 600.0], [0.0, 1200.0]])), [0.015, 0.0, -0.015]
+    )
+    assert camera.binned(2).readout_s < 0.0

@@ -65,7 +65,7 @@ class FieldSimulation:
             "shadows": settings.shadow is not None,
             "dirt": settings.dirt is not None,
             "glare": settings.glare is not None,
-            "a rolling shutter": settings.camera.readout_s > 0.0,
+            "a rolling shutter": settings.camera.readout_s != 0.0,
             "motion of the image": settings.motion != preset(settings.name).motion,
         }
         for name, is_wanted in unsupported.items():
