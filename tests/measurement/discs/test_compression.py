@@ -264,7 +264,7 @@ def tasks_of(photos: Sequence[GreyArray], most: int | None = None) -> list[list[
 
 
 def test_a_curve_is_unreliable_if_rounds_do_not_settle(monkeypatch: pytest.MonkeyPatch) -> None:
-    tasks = tasks_of([compressed(photo, 92) for photo in small_discs(FILM, 0, 1)], 14)
+    tasks = tasks_of([compressed(photo, 92) for photo in small_discs(FILM, 0, 1)], ENOUGH_DISCS)
     assert learn_tone(tasks, Response.UNKNOWN).is_reliable
     monkeypatch.setattr(joint_tone, "_COMPRESSION_ROUNDS", 1)
     assert not learn_tone(tasks, Response.UNKNOWN).is_reliable
@@ -307,7 +307,7 @@ def test_a_step_that_is_not_finite_is_refused() -> None:
 
 def test_film_s_curve_is_learned_through_jpeg() -> None:
     """Learned from the compressed values directly, it was sRGB's, with waves of 0.03 at most."""
-    tasks = tasks_of([compressed(photo, 92) for photo in small_discs(FILM, 0, 2)], 14)
+    tasks = tasks_of([compressed(photo, 92) for photo in small_discs(FILM, 0, 2)], ENOUGH_DISCS)
     learned = learn_tone(tasks, Response.UNKNOWN)
     assert learned.prior is not None
     assert learned.tone is Tone.UNKNOWN  # a line, bent, is likelier by 3
@@ -340,10 +340,13 @@ def test_radii_under_a_stated_curve_are_as_accurate_as_stated(
 
 
 def test_compression_does_not_displace_centres_in_uneven_light() -> None:
-    """A curve that may bend in each disc absorbed JPEG's displacement, by 0.004 px here."""
+    """A curve that may bend in each disc absorbed JPEG's displacement, by 0.004 px here.
+
+    The mean of these four has a standard error of 0.0006 px.
+    """
     photos, truth = stated_photographs(ToneCurve.SRGB, 1.0, radius_px=110.0, side=2, fall=0.06)
-    off = errors_of(photos, truth, Response.SRGB)
-    assert len(off) == 8
+    off = errors_of(photos[:1], truth, Response.SRGB)
+    assert len(off) == 4
     along_px = np.array([error[0] for _, error in off])
     assert abs(along_px.mean()) < 0.0018
     sd_px = np.sqrt([disc.cov[0, 0] for disc, _ in off])
