@@ -7,6 +7,7 @@ import io
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -151,9 +152,10 @@ def browser() -> Iterator[Browser]:
         started.close()
 
 
-@pytest.fixture(params=[1280, 390])
-def page(request: pytest.FixtureRequest, browser: Browser, made: Made) -> Iterator[Page]:
-    context = browser.new_context(viewport={"width": request.param, "height": 900}, offline=True)
+@contextmanager
+def shown(browser: Browser, made: Made, width: int) -> Iterator[Page]:
+    """Show the report in a window of some width; complaints of the page fail the test."""
+    context = browser.new_context(viewport={"width": width, "height": 900}, offline=True)
     opened = context.new_page()
     complaints: list[str] = []
     opened.on("console", lambda message: complaints.append(message.text))
@@ -163,6 +165,19 @@ def page(request: pytest.FixtureRequest, browser: Browser, made: Made) -> Iterat
     yield opened
     context.close()
     assert complaints == []
+
+
+@pytest.fixture(scope="module", params=[1280, 390])
+def page(request: pytest.FixtureRequest, browser: Browser, made: Made) -> Iterator[Page]:
+    """The report in a wide and in a narrow window; tests leave it without an open dialog."""
+    with shown(browser, made, request.param) as opened:
+        yield opened
+
+
+@pytest.fixture
+def wide_page(browser: Browser, made: Made) -> Iterator[Page]:
+    with shown(browser, made, 1280) as opened:
+        yield opened
 
 
 def test_every_figure_is_drawn_and_nothing_is_wider_than_the_window(page: Page) -> None:
@@ -188,8 +203,9 @@ def test_wide_tables_scroll_and_show_that_they_continue(page: Page) -> None:
         assert "local" in box.evaluate("(e) => getComputedStyle(e).backgroundAttachment")
 
 
-def test_the_first_printed_page_is_well_filled(page: Page) -> None:
+def test_the_first_printed_page_is_well_filled(wide_page: Page) -> None:
     """On A4, verdict, agreement and origin take more than half of it; a figure takes the next."""
+    page = wide_page
     page.emulate_media(media="print")
     page.set_viewport_size({"width": 688, "height": 1009})  # 182 mm by 267 mm
     bottom = page.evaluate("document.querySelector('#origin').getBoundingClientRect().bottom")
@@ -246,6 +262,7 @@ def test_a_frame_without_close_up_is_reported_under_any_name(page: Page) -> None
     assert box is not None
     assert page.viewport_size is not None
     assert box["width"] <= page.viewport_size["width"]
+    page.keyboard.press("Escape")
 
 
 def saved(page: Page, name: str) -> str:
@@ -255,7 +272,8 @@ def saved(page: Page, name: str) -> str:
     return download.value.path().read_text(encoding="utf-8")
 
 
-def test_tables_and_numbers_can_be_saved(page: Page, made: Made) -> None:
+def test_tables_and_numbers_can_be_saved(wide_page: Page, made: Made) -> None:
+    page = wide_page
     rows = list(csv.DictReader(io.StringIO(saved(page, "bias.csv"), newline="")))
     assert list(rows[0]) == [column.name for column in BIAS_COLUMNS]
     table = pd.read_parquet(made.folder / "bias.parquet")
