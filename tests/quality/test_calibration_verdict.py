@@ -297,23 +297,19 @@ def test_a_larger_field_is_reported_if_a_distance_was_measured() -> None:
     assert "in its plane" in field.doubt
 
 
-def barred(
-    *lengths: float,
-    points: PointModel = PointModel.STIFF,
-    lens: LensModel = LensModel.RADIAL,
-) -> CameraCalibration:
+def barred(*lengths: float, points: PointModel = PointModel.STIFF) -> CameraCalibration:
     """Return a calibration of the field with bars along its first row and its first column."""
     ends = (("r0c0", "r0c5", 0.2), ("r0c0", "r4c0", 0.16))
     bars = tuple(
         FieldBar(first, last, share * length_m, 0.00002)
         for share, (first, last, length_m) in zip(lengths, ends, strict=False)
     )
-    settings = CalibrationSettings(points, lens)
+    settings = CalibrationSettings(points, LensModel.RADIAL)
     return calibrate_camera(views(), replace(FIELD, bars=bars), (1600, 1200), settings)
 
 
 def test_a_stiff_field_has_the_length_that_was_measured() -> None:
-    result = barred(1.0005, lens=LensModel.AUTO)
+    result = barred(1.0005)
     (residual_m,) = result.bar_residuals_m
     assert abs(residual_m) < 0.00002
     assert judge(result, calibration_numbers(result)).grade is CalibrationGrade.GOOD
@@ -451,7 +447,7 @@ def test_more_than_a_quarter_of_another_zoom_is_not_partly_left_out() -> None:
         for index in wrong:
             right[index] = views(camera=other, distance_m=distance_m)[index]
         made += [replace(view, photo=f"{view.photo} {distance_m}") for view in right]
-    result = calibrated(made, PointModel.STIFF)
+    result = calibrated(made)
     assert result.dropped == ()
     verdict = judge(result, calibration_numbers(result))
     assert "times worse" in verdict.sentence
@@ -496,14 +492,14 @@ def test_discs_that_state_how_badly_they_are_measured_cast_no_doubt() -> None:
 def test_a_photograph_with_a_badly_measured_disc_takes_part() -> None:
     made = nine_views()
     made[4] = partly_covered(made[4], (3, 11))
-    result = calibrated(made, PointModel.STIFF, LensModel.AUTO)
+    result = calibrated(made, lens=LensModel.AUTO)
     assert result.dropped == ()
 
 
 def test_photographs_whose_files_are_turned_by_half_a_turn_take_no_part() -> None:
     made = nine_views()
     made[2], made[7] = upside_down(made[2]), upside_down(made[7])
-    result = calibrated(made, PointModel.STIFF)
+    result = calibrated(made)
     assert set(result.dropped) == {"p2", "p1b"}
     errors = [result.camera.cx - 811.0, result.camera.cy - 583.0]
     assert np.all(np.abs(errors) < 4.0 * calibration_numbers(result).sd[2:4])
@@ -517,7 +513,7 @@ def test_photographs_that_were_turned_and_fit_nearly_are_named() -> None:
     names = tuple(made[index].photo for index in turned)
     for index in turned:
         made[index] = upside_down(made[index])
-    result = calibrated(made, PointModel.STIFF)
+    result = calibrated(made)
     assert result.dropped == ()
     numbers = calibration_numbers(result)
     assert numbers.turned == names
@@ -550,7 +546,7 @@ def test_photographs_by_another_camera_of_the_model_are_named() -> None:
 
 def test_with_two_halves_of_two_zooms_none_is_left_out() -> None:
     other = [replace(view, photo=f"{view.photo}b") for view in views(camera=OTHER_ZOOM)]
-    result = calibrated(views() + other, PointModel.STIFF)
+    result = calibrated(views() + other)
     assert result.dropped == ()
     verdict = judge(result, calibration_numbers(result))
     assert verdict.grade is not CalibrationGrade.GOOD
@@ -565,7 +561,7 @@ def test_two_of_six_photographs_of_another_zoom_are_left_out_together() -> None:
     others = (0, 3)
     for other in others:
         made[other] = by_other_zoom[other]
-    result = calibrated(made, PointModel.STIFF)
+    result = calibrated(made)
     assert result.dropped == tuple(f"p{other}" for other in others)
     assert result.camera.fx == pytest.approx(1500.0, abs=1.0)
     verdict = judge(result, calibration_numbers(result))
@@ -678,7 +674,7 @@ def test_discs_that_fit_in_no_photograph_are_named_and_left_out() -> None:
         vectors = view.vectors.copy()
         vectors[[13, 14], 0] += 30.0, -30.0
         made.append(replace(view, vectors=vectors))
-    result = calibrated(made, PointModel.STIFF, LensModel.AUTO)
+    result = calibrated(made, PointModel.STIFF)
     verdict = judge(result, calibration_numbers(result))
     assert verdict.reasons == ("discs r2c1, r2c2 do not fit in any photograph",)
     assert any("Correct the places or codes" in sentence for sentence in verdict.advice)
