@@ -2,10 +2,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
+
+pytest.importorskip("gtsam", reason="the adjustment's engine: pip install -e '.[aat]'")
+
+import gtsam
+import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.aat import adjust
 from benchmarks.aat.block import Block, project_all, simulate_block
 from benchmarks.aat.figure import draw_benefit
 from benchmarks.aat.gcps import (
@@ -24,12 +29,6 @@ from kgcp.measurement.records import Measurement
 from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
 from kgcp.simulation.ground import Ground
-
-pytest.importorskip("gtsam", reason="the adjustment's engine: pip install -e '.[aat]'")
-
-import gtsam
-
-from benchmarks.aat import adjust
 
 SMALL = replace(BlockSettings(), frames=12, tie_points=400, checks=6)
 CAMERA = Camera(

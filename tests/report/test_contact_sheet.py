@@ -7,12 +7,13 @@ import json
 import re
 import shutil
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Browser, sync_playwright
 
 from kgcp.errors import KgcpError
 from kgcp.io.formats.exclusions import Exclusion, read_exclusions
@@ -195,36 +196,46 @@ def test_a_browser_shows_filters_and_sorts(tmp_path: Path, width: int) -> None:
     assert said["images"] == MEASURED + 1
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    if CHROMIUM is None:
+        pytest.skip("no Chromium")
+    with sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield started
+        started.close()
+
+
 @pytest.mark.parametrize("width", [WIDE_PX, NARROW_PX])
-def test_chosen_cards_are_a_list_for_the_export(tmp_path: Path, width: int) -> None:
+def test_chosen_cards_are_a_list_for_the_export(
+    tmp_path: Path, browser: Browser, width: int
+) -> None:
     name = 'a, "b" #c'
     page_url = write(tmp_path / "sheet", name).page.as_uri()
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = browser.new_context(offline=True).new_page()
-        problems: list[str] = []
-        page.on("pageerror", lambda error: problems.append(str(error)))
-        page.set_viewport_size({"width": width, "height": 800})
-        page.goto(page_url)
-        assert page.locator("article input").count() == MEASURED, "only measured rings are points"
-        save = page.locator("button[name=save]")
-        assert save.is_disabled()
-        for number in (3, 7):
-            page.locator("article input").nth(number).check()
-        page.locator("article input").nth(9).click()
-        page.locator("article input").nth(9).click()
-        assert page.locator("output[name=out]").text_content() == "2 left out"
-        page.select_option("select[name=choice]", "out")
-        assert page.locator("article:visible").count() == 2
-        page.reload()
-        assert page.locator("article:visible").count() == 2, "a page that is opened again knows"
-        with page.expect_download() as download:
-            save.click()
-        assert download.value.suggested_filename == "exclude.csv"
-        download.value.save_as(tmp_path / "exclude.csv")
-        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-        browser.close()
+    context = browser.new_context(offline=True)
+    page = context.new_page()
+    problems: list[str] = []
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.set_viewport_size({"width": width, "height": 800})
+    page.goto(page_url)
+    assert page.locator("article input").count() == MEASURED, "only measured rings are points"
+    save = page.locator("button[name=save]")
+    assert save.is_disabled()
+    for number in (3, 7):
+        page.locator("article input").nth(number).check()
+    page.locator("article input").nth(9).click()
+    page.locator("article input").nth(9).click()
+    assert page.locator("output[name=out]").text_content() == "2 left out"
+    page.select_option("select[name=choice]", "out")
+    assert page.locator("article:visible").count() == 2
+    page.reload()
+    assert page.locator("article:visible").count() == 2, "a page that is opened again knows"
+    with page.expect_download() as download:
+        save.click()
+    assert download.value.suggested_filename == "exclude.csv"
+    download.value.save_as(tmp_path / "exclude.csv")
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    context.close()
     assert problems == []
     expected = tuple(Exclusion(name, f"f_{number:02d}.jpg", "A") for number in (3, 7))
     assert read_exclusions(tmp_path / "exclude.csv") == expected
