@@ -105,7 +105,7 @@ def test_a_frame_turned_upside_down_gives_the_same_result(
     """When knots began at the window's corner, results differed by 0.5 to 1.1 σ (RMS)."""
     turned = replace(LENS, cx=LENS.width - 1.0 - LENS.cx, cy=LENS.height - 1.0 - LENS.cy)
     half_turn, off = np.diag([-1.0, -1.0, 1.0]), []
-    for seed in range(4):
+    for seed in range(2):
         rng = np.random.default_rng(500 + seed)
         pose = some_pose(rng)
         grey = photograph(LENS, pose, rng, gain=0.65, field=lights(rng))
@@ -210,7 +210,7 @@ def test_fits_with_levels_do_not_depend_on_their_start(
     """With white and the plate's levels free at once, fits in dirt stayed 2 σ off."""
     camera, srgb = replace(LENS, response=Response.UNKNOWN), Sensor(tone=ToneCurve.SRGB)
     apart = []
-    for seed in range(3):
+    for seed in range(2):
         rng = np.random.default_rng(500 + seed)
         pose = some_pose(rng)
         grey = photograph(camera, pose, rng, sensor=srgb, gain=0.65, field=lights(rng))
@@ -352,7 +352,7 @@ def test_the_centre_is_less_certain_if_processing_hides_a_skew(
     """With the usual share of the skew's displacement, z of these centres was 2.1."""
     camera, squares = replace(LENS, response=Response.UNKNOWN), []
     phone = Phone(bilateral=0.3)
-    for seed in range(FRAMES):
+    for seed in range(2):
         rng = np.random.default_rng(900 + seed)
         pose, lens = some_pose(rng), Aberration(coma=0.2, coma_deg=rng.uniform(0.0, 360.0))
         grey = phone_photograph(pose, rng, phone, lens)
