@@ -49,6 +49,27 @@ def fewest_sub_pixels() -> Iterator[None]:
 
 
 @pytest.fixture
+def no_place_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave figures to the tests of the page: to draw them takes longer than to place targets."""
+    monkeypatch.setattr(
+        "kgcp.pipeline.ground.place.draw_places",
+        lambda _: dict.fromkeys(("diameters", "frames", "positions"), b""),
+    )
+
+
+@pytest.fixture
+def no_bias_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave figures to the tests of the page: to draw them takes longer than all else."""
+    import numpy as np
+
+    from kgcp.report.style import Picture
+
+    blank = Picture(b"", np.zeros(0, np.intp), np.zeros((0, 2), np.intp))
+    drawn = dict.fromkeys(("error", "time", "image", "map"), blank)
+    monkeypatch.setattr("kgcp.pipeline.bias_report.draw_figures", lambda *_: drawn)
+
+
+@pytest.fixture
 def sigint_raises() -> Iterator[None]:
     """Let SIGINT raise `KeyboardInterrupt` here, and by default end processes started here.
 

@@ -79,12 +79,3 @@ def unmeasured(tmp_path: Path) -> SampleFlight:
 def measured(measured_sample: SampleFlight, tmp_path: Path) -> SampleFlight:
     """A copy of the flight after `kgcp detect`."""
     return SampleFlight(shutil.copytree(measured_sample.path, tmp_path / "sample"))
-
-
-@pytest.fixture
-def no_place_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave figures to the tests of the page: to draw them takes longer than to place targets."""
-    monkeypatch.setattr(
-        "kgcp.pipeline.ground.place.draw_places",
-        lambda _: dict.fromkeys(("diameters", "frames", "positions"), b""),
-    )

@@ -354,6 +354,7 @@ def test_two_exports_do_not_write_to_one_folder(folder: Path) -> None:
     assert not [*(folder / "kgcp").glob(".*")]
 
 
+@pytest.mark.usefixtures("no_bias_figures")
 def test_a_bias_report_leaves_out_what_an_export_does(folder: Path) -> None:
     """A ring of which a person has seen that it is not the target counts in neither."""
     unwanted = folder / "exclude.csv"

@@ -139,6 +139,7 @@ def test_the_command_to_repeat_names_folder_and_settings(tmp_path: Path) -> None
     assert line.endswith("(its settings were min_radius_px = 9.0)")
 
 
+@pytest.mark.usefixtures("no_bias_figures")
 def test_tables_record_what_they_were_made_from(measured: SampleFlight) -> None:
     detections = metadata(measured.out / "detections.parquet")
     assert set(json.loads(detections["digests"])) == (

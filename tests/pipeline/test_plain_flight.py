@@ -93,6 +93,7 @@ def test_every_target_is_measured_at_its_true_centre(folder: Path) -> None:
         assert_at(rows, FLIGHT.centres_m(frame)[: len(TARGETS)])
 
 
+@pytest.mark.usefixtures("no_place_figures")
 def test_four_discs_can_orient_frames_check_a_vehicle_and_be_placed(folder: Path) -> None:
     """The steps of docs/ground.md, from detections to points."""
     flight = read_flight(folder)
@@ -133,6 +134,7 @@ class Around(PlainFlight):
         return centres, np.array(rotations)
 
 
+@pytest.mark.usefixtures("no_place_figures")
 def test_placed_normals_do_not_depend_on_the_stated_ones(tmp_path: Path) -> None:
     """One on a roof, one wrongly stated to be level: the result does not contain the prior."""
     roof, tilted = (0.5, -0.2, 1.0), (-0.1, 0.05, 1.0)

@@ -171,7 +171,7 @@ def test_every_rule_approximates_its_integral(
     radius: float, blur: tuple[float, float, float], streak: tuple[float, float]
 ) -> None:
     disc = some_disc(radius, blur, streak)
-    x, y = around(radius, 4.0 + 0.5 * float(np.hypot(*streak)), 41)
+    x, y = around(radius, 4.0 + 0.5 * float(np.hypot(*streak)), 21)
     # docs/method/image_model.md, "Blurred discs"
     tolerance = 3e-3 if disc.rule is Quadrature.EDGE else 3e-4
     assert np.abs(disc.level(x, y) - by_chords(disc, x, y, 900)).max() < tolerance

@@ -26,7 +26,6 @@ from kgcp.measurement.records import ToneBase
 from kgcp.pipeline.bias_report import FIGURE_FILES, FlightBias
 from kgcp.quality.bias_study import BiasStudy, Comparison, ReferenceSds
 from kgcp.quality.learnt_imaging import LearntImaging
-from kgcp.report.style import Picture
 from kgcp.settings import DetectSettings
 from tests.test_docs import first_column, section
 
@@ -119,14 +118,6 @@ def sighted(row: pd.Series[float], frame: str, delta_px: float) -> Comparison:
 
 def of_sample(compared: BiasStudy) -> FlightBias:
     return FlightBias(read_flight(SAMPLE), DetectSettings(), compared, {}, learnt=LEARNT)
-
-
-@pytest.fixture
-def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave figures to the tests of the page: to draw them takes longer than all else."""
-    blank = Picture(b"", np.zeros(0, np.intp), np.zeros((0, 2), np.intp))
-    drawn = dict.fromkeys(("error", "time", "image", "map"), blank)
-    monkeypatch.setattr("kgcp.pipeline.bias_report.draw_figures", lambda *_: drawn)
 
 
 @pytest.fixture(scope="module")
@@ -324,7 +315,7 @@ def test_figures_are_not_written_among_the_frames(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.usefixtures("_no_figures")
+@pytest.mark.usefixtures("no_bias_figures")
 def test_an_interrupted_report_leaves_that_of_the_run_before(
     compare: Compare, study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -340,7 +331,7 @@ def test_an_interrupted_report_leaves_that_of_the_run_before(
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-@pytest.mark.usefixtures("_no_figures")
+@pytest.mark.usefixtures("no_bias_figures")
 def test_a_report_that_cannot_be_written_is_not_mixed_with_that_of_the_run_before(
     compare: Compare, study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
