@@ -300,19 +300,6 @@ def test_bias_report_writes_table_figures_and_page(flight: FlightFolder) -> None
     assert numbers["verdict"] == "look"  # five frames are too few
 
 
-def test_the_same_input_makes_the_same_bytes(flight: FlightFolder, tmp_path: Path) -> None:
-    source = str(flight.out / "detections.parquet")
-    for name in ("one", "two"):
-        for command in ("export-gcp", "bias-report"):
-            result = flight.run(command, "--out", str(tmp_path / name), "--detections", source)
-            assert result.exit_code == 0, result.output
-    one = tmp_path / "one"
-    names = sorted(str(path.relative_to(one)) for path in one.rglob("*") if path.is_file())
-    assert "bias_report.html" in names
-    for name in names:
-        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
-
-
 def test_a_flight_without_reference_poses_is_reported(flight: FlightFolder) -> None:
     flight.edit('[reference]\nposes = "reference.csv"\n', "")
     assert "[reference]" in flight.fails("bias-report")
