@@ -259,9 +259,7 @@ def test_a_step_in_the_poses_is_not_taken_for_a_moved_target(
 
 @pytest.mark.usefixtures("no_place_figures")
 @pytest.mark.parametrize(("names", "flights"), [("A", 4), ("AB", 2)])
-def test_standard_deviations_cover_drifting_poses(
-    tmp_path: Path, names: str, flights: int
-) -> None:
+def test_standard_deviations_cover_drifting_poses(tmp_path: Path, names: str, flights: int) -> None:
     ratios = []
     for seed in range(flights):
         rng = np.random.default_rng(seed)
