@@ -239,7 +239,7 @@ def _posterior(
         around = np.arange(max(place - _MAX_COMPARED, 0), min(place + _MAX_COMPARED, len(compared)))
         order = np.argsort(np.abs(time_s[compared[around]] - time_s[row]), kind="stable")
         nearest = around[order[:_MAX_COMPARED]]
-        shown_by = int(inner[np.argmin(np.abs(time_s[inner] - time_s[row]))])
+        shown_by = min(max(row, int(inner[0])), int(inner[-1]))
         error2 = off2[nearest]
         if shown_by != row:
             if abs(time_s[shown_by] - time_s[row]) > _MAX_INTERVALS * usual_s:
