@@ -22,6 +22,7 @@ from kgcp.measurement.discs.records import (
     Polarity,
     ellipse_of_moments,
 )
+from kgcp.measurement.exif_camera import ExifCamera
 from kgcp.targets.fields.layout import Field
 from kgcp.targets.fields.naming import Naming, NamingProblem, SeenDiscs, name_discs
 from kgcp.targets.fields.point_naming import name_by_codes, name_by_places
@@ -42,7 +43,7 @@ class PhotoDiscs:
     photo: str
     width: int
     height: int
-    lens: str  # camera and focal length by EXIF; empty: not known
+    exif_camera: ExifCamera
     outlines: int  # number of outlines of the field's polarity, named or not
     is_symmetric: bool  # whether the naming would fit a rotated field, too
     point: FloatArray  # (k,): index of the disc in the field
@@ -88,7 +89,7 @@ def learn_from_fields(greys: Iterable[GreyArray], task: PhotoTask) -> CameraTone
 
 
 def measure_field(
-    grey: GreyArray, task: PhotoTask, photo: str, lens: str
+    grey: GreyArray, task: PhotoTask, photo: str, exif_camera: ExifCamera
 ) -> PhotoDiscs | PhotoMiss:
     """Find, name and measure the discs of a field in a photograph."""
     outlines = find_outlines(grey)
@@ -132,7 +133,7 @@ def measure_field(
         photo,
         width,
         height,
-        lens,
+        exif_camera,
         len(own),
         naming.is_symmetric,
         np.array([point for point, _ in named], dtype=np.float64),
@@ -211,7 +212,7 @@ def measure_more(
         first.photo,
         first.width,
         first.height,
-        first.lens,
+        first.exif_camera,
         first.outlines,
         first.is_symmetric,
         points[order],

@@ -110,7 +110,7 @@ def _read(path: Path, header: FrameHeader, size: tuple[int, int]) -> Camera:
             f"{path}: is for {camera.width} x {camera.height} px, {_WORDS.other_size} {size[0]} x"
             f" {size[1]}; use the calibration of this frame size"
         )
-    own, other = stated.by_exif.difference(header)
+    own, other = stated.by_exif.difference(header.exif_camera)
     if own:
         raise KgcpError(
             f"{path}: is for {own}, but the frames are by {other}; use the calibration of this"

@@ -30,7 +30,7 @@ from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight, read_flight
 from kgcp.io.images.exif import read_frame_header
 from kgcp.io.images.frames import list_frames
-from kgcp.quality.checks.frame_header import ExifCamera
+from kgcp.measurement.exif_camera import ExifCamera
 from kgcp.simulation.flight import FlightPlan
 from tests.systems import not_on_windows
 

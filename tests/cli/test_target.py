@@ -16,6 +16,7 @@ from kgcp.io.flight.field_file import read_field
 from kgcp.io.flight.flight import read_printed_targets
 from kgcp.io.print import write
 from kgcp.measurement.discs.records import Operator
+from kgcp.measurement.exif_camera import ExifCamera
 from kgcp.measurement.field_photograph import PhotoDiscs, PhotoTask, measure_field
 from kgcp.targets.code_design import LEAST_DISTANCE
 from kgcp.targets.fields.layout import Field
@@ -159,7 +160,9 @@ def test_a_field_is_drawn_with_its_field_toml(tmp_path: Path) -> None:
     assert (field.columns, field.rows) == (9, 6)
     grey = cv2.imread(str(tmp_path / "target_field.png"), cv2.IMREAD_GRAYSCALE)
     assert grey is not None
-    naming = measure_field(grey, PhotoTask(field, Response.LINEAR, Operator.CENTROID), "p", "")
+    naming = measure_field(
+        grey, PhotoTask(field, Response.LINEAR, Operator.CENTROID), "p", ExifCamera()
+    )
     assert isinstance(naming, PhotoDiscs)
     assert len(naming.point) == 54
     steps = np.linalg.norm(np.diff(naming.vectors[:9, :2], axis=0), axis=1)
@@ -208,7 +211,9 @@ def test_a_field_of_points_is_drawn_with_its_codes(tmp_path: Path) -> None:
     field = read_field(str(tmp_path / "field.toml"))
     grey = cv2.imread(str(tmp_path / "target_field.png"), cv2.IMREAD_GRAYSCALE)
     assert grey is not None
-    naming = measure_field(grey, PhotoTask(field, Response.LINEAR, Operator.CENTROID), "p", "")
+    naming = measure_field(
+        grey, PhotoTask(field, Response.LINEAR, Operator.CENTROID), "p", ExifCamera()
+    )
     assert isinstance(naming, PhotoDiscs)
     assert naming.point.tolist() == list(range(len(_CODES)))
     off_px = naming.vectors[:, :2] - 100.0 / 0.0254 * field.points_m()[:, :2]

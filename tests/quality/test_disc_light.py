@@ -10,6 +10,7 @@ import pytest
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.measurement.discs.records import Operator
+from kgcp.measurement.exif_camera import ExifCamera
 from kgcp.measurement.field_photograph import PhotoDiscs, PhotoTask, measure_field
 from kgcp.quality.disc_light import DiscLight, light_on_discs
 from kgcp.simulation.field_session import FieldSession, field_photograph, printed_points
@@ -106,7 +107,7 @@ def test_the_negative_of_a_photograph_is_recognised() -> None:
     doubts = []
     for photo, own in ((grey, field), (255 - grey, inverted)):
         task = PhotoTask(own, Response.LINEAR, Operator.MODEL)
-        found = measure_field(photo, task, "p", "")
+        found = measure_field(photo, task, "p", ExifCamera())
         assert isinstance(found, PhotoDiscs)
         levels, clipped = found.appearance[:, :2], found.appearance[:, 3]
         doubts.append(light_on_discs([(found.vectors[:, :2], levels, clipped)]).doubt)

@@ -9,8 +9,8 @@ import numpy as np
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, CalibrationCovariance
 from kgcp.geometry.camera import Camera
 from kgcp.io.flight.toml_draft import toml_text
+from kgcp.measurement.exif_camera import ExifCamera
 from kgcp.quality.checks.calibration import CalibrationGrade
-from kgcp.quality.checks.frame_header import ExifCamera
 
 
 def camera_toml(

@@ -13,8 +13,8 @@ from kgcp.geometry.camera import Camera, Response, TimeReference
 from kgcp.io.flight.toml_file import read_toml
 from kgcp.io.flight.toml_table import TomlTable
 from kgcp.io.formats.calibrations import FORMATS, read_calibration
+from kgcp.measurement.exif_camera import ExifCamera
 from kgcp.quality.checks.calibration import CalibrationGrade
-from kgcp.quality.checks.frame_header import ExifCamera
 from kgcp.settings import require_range
 
 _NEEDED = ("fx", "fy", "cx", "cy")  # what has no default

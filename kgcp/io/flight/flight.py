@@ -23,8 +23,8 @@ from kgcp.io.flight.vehicle_table import VehicleTable, read_vehicle
 from kgcp.io.formats.frame_times import FORMATS as TIMES_FORMATS
 from kgcp.io.formats.orientations import FORMATS as POSE_FORMATS
 from kgcp.io.formats.orientations.records import OrientationFileOptions
+from kgcp.measurement.exif_camera import ExifCamera
 from kgcp.quality.checks.calibration import CalibrationGrade
-from kgcp.quality.checks.frame_header import ExifCamera
 from kgcp.settings import require_kind
 from kgcp.targets.layout import Target
 from kgcp.targets.plain import AnyTarget, PlainTarget

@@ -67,9 +67,7 @@ def measure_photo(task: PhotoTask, photo: Photo) -> PhotoDiscs | PhotoMiss:
         grey, header = _read(photo)
     except Rejection as rejection:
         return PhotoMiss(photo.name, 0, 0, rejection.reason.value, rejection.detail)
-    focal = f"{header.focal_mm:g} mm" if header.focal_mm else ""
-    lens = " ".join(filter(None, (header.camera, focal)))
-    return measure_field(grey, task, photo.name, lens)
+    return measure_field(grey, task, photo.name, header.exif_camera)
 
 
 @single_threaded()

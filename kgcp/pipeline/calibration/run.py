@@ -17,12 +17,12 @@ import numpy as np
 from kgcp.errors import KgcpError, KgcpWarning, Reason
 from kgcp.geometry.camera import Response
 from kgcp.io.files.safe_read import is_file, is_folder
-from kgcp.io.images.exif import read_frame_header
 from kgcp.io.images.frames import FRAME_SUFFIXES, kind_of, list_frames
 from kgcp.io.images.remote import stamps_of
 from kgcp.io.tables.provenance import versions
 from kgcp.measurement.discs.camera_tone import CameraTone
 from kgcp.measurement.discs.records import Operator
+from kgcp.measurement.exif_camera import ExifCamera
 from kgcp.measurement.field_photograph import PhotoDiscs, PhotoMiss, PhotoTask
 from kgcp.network.calibration import LEAST_VIEWS, calibrate_camera, missing_discs
 from kgcp.network.calibration_records import (
@@ -44,7 +44,6 @@ from kgcp.pipeline.execution.executor import WorkerPool, open_pool
 from kgcp.pipeline.execution.journal import Journal, fingerprint
 from kgcp.pipeline.execution.resilient_map import TaskFailure
 from kgcp.pipeline.execution.threads import single_threaded
-from kgcp.quality.checks.frame_header import ExifCamera
 from kgcp.targets.fields.naming import NamingProblem
 from kgcp.targets.fields.points import AnyField
 
@@ -354,14 +353,16 @@ def _of_one_camera(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[PhotoDiscs
         If EXIF names several cameras or focal lengths.
     """
     found = [result for result in results if isinstance(result, PhotoDiscs)]
-    lenses = Counter(result.lens for result in found if result.lens)
-    for camera in {_without_focal(lens) for lens in lenses if lens != _without_focal(lens)}:
-        del lenses[camera]  # photographs without a focal length in their EXIF may have any
+    lenses = Counter((result.exif_camera.name, result.exif_camera.focal_mm) for result in found)
+    # photographs without a focal length in their EXIF may have any
+    for name in {"", *(name for name, focal_mm in lenses if focal_mm is not None)}:
+        del lenses[name, None]
     if len(lenses) > 1:
         (first, first_count), (second, second_count) = lenses.most_common(2)
         raise KgcpError(
-            f"the photographs are by several cameras or focal lengths: {first_count} by {first},"
-            f" {second_count} by {second}; calibrate them separately"
+            "the photographs are by several cameras or focal lengths:"
+            f" {first_count} by {_lens_text(*first)}, {second_count} by {_lens_text(*second)};"
+            " calibrate them separately"
         )
     sizes = Counter((result.width, result.height) for result in found)
     if not sizes:
@@ -383,8 +384,8 @@ def _of_one_camera(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[PhotoDiscs
     ]
 
 
-def _without_focal(lens: str) -> str:
-    return lens.removesuffix(" mm").rpartition(" ")[0] if lens.endswith(" mm") else lens
+def _lens_text(camera: str, focal_mm: float | None) -> str:
+    return " ".join(filter(None, (camera, f"{focal_mm:g} mm" if focal_mm is not None else "")))
 
 
 def _without_duplicates(
@@ -486,7 +487,5 @@ def _outcome(
             size = (result.width, result.height)
             misses.append(PhotoMiss(result.photo, *size, UNLIKE_FIELD, ""))
     names = tuple(photo.name for photo in photos)
-    exif = ExifCamera.of(
-        [read_frame_header(photo.path, photo.name) for photo in photos if photo.name in discs]
-    )
+    exif = ExifCamera.shared_by([result.exif_camera for result in discs.values()])
     return PhotoCalibration(field, options, calibration, discs, tuple(misses), names, exif)

@@ -38,6 +38,7 @@ from kgcp.io.files.safe_read import is_file
 from kgcp.measurement import records
 from kgcp.measurement.discs.camera_tone import CameraTone
 from kgcp.measurement.discs.fit_disc import ProcessingPrior
+from kgcp.measurement.exif_camera import ExifCamera
 from kgcp.measurement.field_photograph import PhotoDiscs, PhotoMiss
 from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.records import Considered, FrameResult, Imaging, Miss, TimeSource, ToneBase
@@ -48,7 +49,10 @@ _RECORDS: dict[str, type] = {
     name: record
     for name, record in vars(records).items()
     if isinstance(record, type) and is_dataclass(record)
-} | {record.__name__: record for record in (PhotoDiscs, PhotoMiss, CameraTone, ProcessingPrior)}
+} | {
+    record.__name__: record
+    for record in (ExifCamera, PhotoDiscs, PhotoMiss, CameraTone, ProcessingPrior)
+}
 _REASONS: dict[str, Reason] = {reason.value: reason for reason in Reason}
 _TONE_BASES: dict[str, ToneBase] = {base.value: base for base in ToneBase}
 _TIME_SOURCES: dict[str, TimeSource] = {source.value: source for source in TimeSource}

@@ -14,6 +14,7 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.io.flight.flight import Flight
 from kgcp.io.images.frames import list_frames, matching_frames, read_grey
 from kgcp.measurement.discs.records import Operator
+from kgcp.measurement.exif_camera import ExifCamera
 from kgcp.measurement.field_photograph import (
     PhotoMiss,
     PhotoTask,
@@ -76,7 +77,7 @@ def _oriented(
         grey = read_grey(flight.frames_folder / frame, flight.camera)
     except Rejection as rejection:
         return OrientedFrame(frame, None, rejection.detail)
-    measured = measure_field(grey, task, frame, "")
+    measured = measure_field(grey, task, frame, ExifCamera())
     if isinstance(measured, PhotoMiss):
         return OrientedFrame(frame, None, f"{REASONS[measured.reason]} ({measured.detail})")
     if measured.is_symmetric:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kgcp.geometry.camera import Camera
+from kgcp.measurement.exif_camera import FOCUS_FACTOR, ExifCamera
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
 
 _SMALL_FORMAT_MM = 36.0, math.hypot(36.0, 24.0)  # width and diagonal; equivalents refer to either
@@ -17,8 +18,6 @@ _SMALL_FORMAT_MM = 36.0, math.hypot(36.0, 24.0)  # width and diagonal; equivalen
 # width or the diagonal, and may be those of cropped video.
 _FOCAL_TOLERANCE = 1.25
 _SIZE_TOLERANCE = 1.1  # the same about half and double size
-_FOCUS_FACTOR = 1.03  # by which focusing changes a focal length in EXIF
-_ROUNDING_35_MM = 1.0  # difference of two equivalents that are rounded to whole millimetres
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,41 +38,10 @@ class FrameHeader:
     latitude_deg: float | None = None
     altitude_m: float | None = None  # above the take-off point
 
-
-@dataclass(frozen=True, slots=True)
-class ExifCamera:
-    """What EXIF says about the camera that took the photographs of a calibration."""
-
-    name: str = ""  # maker, model and serial number; empty: not known
-    focal_mm: float | None = None
-    focal_35_mm: float | None = None
-
-    @classmethod
-    def of(cls, headers: Sequence[FrameHeader]) -> ExifCamera:
-        """Return what all headers that state it agree on."""
-        names = {header.camera for header in headers if header.camera.isprintable()} - {""}
-        focals_mm = {header.focal_mm for header in headers} - {None}
-        focals_35_mm = {header.focal_35_mm for header in headers} - {None}
-        return cls(
-            names.pop() if len(names) == 1 else "",
-            focals_mm.pop() if len(focals_mm) == 1 else None,
-            focals_35_mm.pop() if len(focals_35_mm) == 1 else None,
-        )
-
-    def difference(self, header: FrameHeader) -> tuple[str, str]:
-        """Return what another camera, zoom or crop is here and in a frame; empty: no difference."""
-        own, other = self.name.casefold(), header.camera.casefold()
-        if own and other and not (own.startswith(other) or other.startswith(own)):
-            return self.name, header.camera  # either may lack the serial number
-        for own_mm, other_mm, rounding_mm, kind in (
-            (self.focal_mm, header.focal_mm, 0.0, ""),
-            (self.focal_35_mm, header.focal_35_mm, _ROUNDING_35_MM, " (35 mm equivalent)"),
-        ):
-            if own_mm is None or other_mm is None:
-                continue
-            if max(own_mm, other_mm) > _FOCUS_FACTOR * min(own_mm, other_mm) + rounding_mm:
-                return f"{own_mm:g} mm{kind}", f"{other_mm:g} mm{kind}"
-        return "", ""
+    @property
+    def exif_camera(self) -> ExifCamera:
+        """Camera and focal length."""
+        return ExifCamera(self.camera, self.focal_mm, self.focal_35_mm)
 
 
 def check_frames(
@@ -156,7 +124,7 @@ def _zooms_mm(headers: Sequence[FrameHeader]) -> dict[float, float]:
     zooms: dict[float, float] = {}
     first = 0.0
     for focal_mm in sorted({header.focal_mm for header in headers if header.focal_mm is not None}):
-        if focal_mm > _FOCUS_FACTOR * first:
+        if focal_mm > FOCUS_FACTOR * first:
             first = focal_mm
         zooms[focal_mm] = first
     return zooms
@@ -198,7 +166,7 @@ def _check_focal_length(headers: Sequence[FrameHeader], camera: Camera) -> Itera
 
 
 def _check_calibrated(headers: Sequence[FrameHeader], calibrated: ExifCamera) -> Iterator[Doubt]:
-    differences = [(header.frame, *calibrated.difference(header)) for header in headers]
+    differences = [(header.frame, *calibrated.difference(header.exif_camera)) for header in headers]
     others = [difference for difference in differences if any(difference[1:])]
     if not others:
         return

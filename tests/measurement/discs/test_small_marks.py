@@ -12,6 +12,7 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.discs.records import Operator
+from kgcp.measurement.exif_camera import ExifCamera
 from kgcp.measurement.field_photograph import PhotoDiscs, PhotoTask, measure_field
 from kgcp.simulation.field_session import FieldPhotograph, FieldSession, field_photograph
 from kgcp.targets.fields.layout import Field, FieldPolarity, GridKind, Mark
@@ -56,7 +57,7 @@ def test_discs_are_named_by_a_mark_whose_hole_has_no_outline(kind: str) -> None:
         ]
         unseen += all(each.hole is None for each in discs)
         task = PhotoTask(field, Response.LINEAR, Operator.CENTROID)
-        found = measure_field(grey, task, "p", "")
+        found = measure_field(grey, task, "p", ExifCamera())
         assert isinstance(found, PhotoDiscs), found
         named = found.point.astype(np.intp)
         camera_points = field.points_m()[named] @ taken.pose.rotation.T + taken.pose.translation_m

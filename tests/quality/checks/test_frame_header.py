@@ -5,8 +5,9 @@ from dataclasses import replace
 import pytest
 
 from kgcp.geometry.camera import Camera
+from kgcp.measurement.exif_camera import ExifCamera
 from kgcp.quality.checks.doubt import Cause
-from kgcp.quality.checks.frame_header import ExifCamera, FrameHeader, check_frames
+from kgcp.quality.checks.frame_header import FrameHeader, check_frames
 
 CAMERA = Camera(4000, 3000, 2900.0, 2900.0, 2010.0, 1490.0)
 DJI = [FrameHeader(f"{number}.jpg", (4000, 3000), "DJI FC300S", 3.61, 26.0) for number in range(20)]
@@ -96,7 +97,7 @@ def test_a_calibration_of_another_camera_is_reported(calibrated: ExifCamera, wor
 @pytest.mark.parametrize(
     "calibrated",
     [
-        ExifCamera.of(DJI),
+        ExifCamera.shared_by([header.exif_camera for header in DJI]),
         ExifCamera("Dji FC300S 0123", 3.65, 27.0),  # frames without the serial number
         ExifCamera(),
     ],
@@ -107,5 +108,7 @@ def test_the_same_camera_raises_no_doubt(calibrated: ExifCamera) -> None:
 
 def test_only_what_all_photographs_agree_on_is_stated() -> None:
     others = [FrameHeader("a.png"), FrameHeader("b.jpg", None, "DJI FC300S", 3.61, 52.0)]
-    assert ExifCamera.of([*DJI, *others]) == ExifCamera("DJI FC300S", 3.61, None)
-    assert ExifCamera.of([FrameHeader("c.jpg", None, "A\nB")]) == ExifCamera()
+    assert ExifCamera.shared_by([header.exif_camera for header in (*DJI, *others)]) == ExifCamera(
+        "DJI FC300S", 3.61, None
+    )
+    assert ExifCamera.shared_by([ExifCamera("A\nB")]) == ExifCamera()
