@@ -82,24 +82,21 @@ def _size_chi2(target: PlainTarget, prediction: PlainPrediction, pose: Pose) -> 
     return (off / sd) ** 2
 
 
-def check_agreement(
+def disturbance_factor(
     camera: Camera,
     target: PlainTarget,
     prediction: PlainPrediction,
     fit: CirclesFit,
     circles: int,
 ) -> float:
-    """Refuse a measurement whose size, place or shape differs from the prediction.
+    """Return the factor by which the covariance of a measurement is to be enlarged, at least 1.
 
-    Returns
-    -------
-    factor : float
-        By which its covariance is to be enlarged, at least 1. A shadow or a cover that changes size
-        and shape displaces the centre, too.
+    A shadow or a cover that changes size and shape displaces the centre, too.
 
     Raises
     ------
     Rejection
+        If size, place or shape differ too much from the prediction.
     """
     size_chi2 = _size_chi2(target, prediction, fit.pose)
     off_px = camera.project(fit.pose.translation_m[None])[0] - prediction.centre_px

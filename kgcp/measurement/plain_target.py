@@ -32,7 +32,7 @@ from kgcp.measurement.discs.records import (
     ellipse_of_moments,
 )
 from kgcp.measurement.image_model.window import contour_px, semi_major_axis_px
-from kgcp.measurement.plain_checks import check_agreement, check_edge, tolerated
+from kgcp.measurement.plain_checks import check_edge, disturbance_factor, tolerated
 from kgcp.measurement.plain_pose import (
     CircleMoments,
     CirclesFit,
@@ -205,7 +205,7 @@ def _checked(
         tolerant = fit_circles(
             camera, tolerated(circles.images), start, prediction.prior, prediction.rotation
         )
-        factor = check_agreement(camera, target, prediction, tolerant, len(circles.discs))
+        factor = disturbance_factor(camera, target, prediction, tolerant, len(circles.discs))
         images = replace(circles.images, covs=factor * circles.images.covs)
         fit, other = _best_fits(camera, images, start, prediction)
     except np.linalg.LinAlgError:
