@@ -118,7 +118,7 @@ PRESET_NAMES = (
 )
 @click.option(
     "--rolling",
-    type=NumberRange(0.0, 10.0),
+    type=NumberRange(0.0, 1.0),
     metavar="SECONDS",
     help="Expose rows one after the other, the last this long after the first.",
 )

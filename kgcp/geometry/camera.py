@@ -29,6 +29,9 @@ from kgcp.geometry.distortion import (
 )
 from kgcp.settings import require_range, require_word
 
+# The slowest sensors take a third of a second. Beyond a second, the number is in milliseconds.
+_MAX_READOUT_S = 1.0
+
 
 class Response(StrEnum):
     """Relation of grey values to light."""
@@ -178,7 +181,7 @@ class Camera:
             value = getattr(self, key)
             if not isinstance(value, Real) or not math.isfinite(value):
                 raise SettingError(key, "is not a finite number", "give a number or leave it out")
-        require_range("readout_s", self.readout_s, -10.0, 10.0, unit="s")
+        require_range("readout_s", self.readout_s, -_MAX_READOUT_S, _MAX_READOUT_S, unit="s")
         for key, words in (("response", Response), ("time_reference", TimeReference)):
             object.__setattr__(self, key, require_word(key, getattr(self, key), words))
         require_range("motion_sd_deg_s", self.motion_sd_deg_s, 0.0, 1000.0, unit="deg/s")

@@ -197,7 +197,7 @@ def test_optional_keys_have_the_defaults_of_the_folder(tmp_path: Path, write: Wr
         ("fx = 2300.0", "fx = -1", r"fx: -1 px is out of range; give a value above 0"),
         ("cx = 803.2", "cx = 9e6", r"cx: 9e\+06 px is far outside"),
         ('"linear"', '"film"', 'response: \'film\' is not known; give one of "linear", "srgb"'),
-        ("readout_s = 0.01", "readout_s = -30", "readout_s: -30 s is out of range"),
+        ("readout_s = 0.01", "readout_s = -5", "readout_s: -5 s is out of range"),
         ("readout_s = 0.01", "motion_sd_deg_s = 3", "has no effect without readout_s; add"),
         ('name = "A"\n', 'name = "A"\nshape = "Coded"\n', "A shape: 'Coded' is not known; give"),
         ("= 0.9\n", "= -0.9\n", r"A outer_diameter_m: -0.9 m is out of range"),
