@@ -29,6 +29,7 @@ from kgcp.io.formats.marks import HandMark
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.plain_prediction import PredictedPlace
 from kgcp.measurement.records import FrameResult, Measurement, Miss, is_unreadable
+from kgcp.network.ground.frame_motions import motions_by_rates
 from kgcp.network.ground.frame_poses import orient_frames, print_scale_sd
 from kgcp.pipeline.frame_priors import Priors
 from kgcp.quality.checks.static_targets import PlainSearch
@@ -316,7 +317,7 @@ def _by_other_targets(
         positions.static,
         flight.camera,
         sd_scale=print_scale_sd(flight.static_targets),
-        rotations=data.scene_rotations,
+        motions=motions_by_rates(data.scene_rotations),
     ):
         if oriented.pose is not None:
             orientation = FrameOrientation(

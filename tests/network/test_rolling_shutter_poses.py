@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.pose import Pose
+from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition
 from kgcp.measurement.plate_prior import SceneRotation
 from kgcp.network.ground.field_pose import orient_by_field
+from kgcp.network.ground.frame_motions import orient_moving
 from kgcp.network.ground.frame_poses import UNSTATED_SCALE_SD, FramePose, orient_frames
-from kgcp.network.ground.point_images import CameraPose
-from kgcp.network.ground.position_check import wrong_input
+from kgcp.network.ground.point_images import CameraMotion, CameraPose
+from kgcp.network.ground.position_check import FastCamera, WrongPosition, wrong_input
 from kgcp.targets.fields.points import AnyField
 from tests.ground_flight import CAMERA as GLOBAL_CAMERA
 from tests.ground_flight import GroundFlight
@@ -89,12 +90,12 @@ def drawn_motion(rng: np.random.Generator) -> FloatArray:
     return np.asarray(sds * rng.standard_normal(6))
 
 
-def scene_rotation(
+def motion_by_rates(
     flight: GroundFlight, row: int, turn_rad_s: FloatArray, sd_rad_s: float
-) -> SceneRotation:
-    """How the scene turns where the camera turns in the world."""
+) -> CameraMotion:
+    """What the camera's rates show where the camera turns in the world."""
     x, y, z = (-flight.rotations[row].T @ turn_rad_s).tolist()
-    return SceneRotation((x, y, z), sd_rad_s)
+    return CameraMotion(SceneRotation((x, y, z), sd_rad_s))
 
 
 def error_of(found: FramePose, pose: CameraPose) -> FloatArray:
@@ -146,16 +147,16 @@ def test_the_rates_of_a_hovering_camera_make_poses_more_certain() -> None:
     for seed in range(4):  # the errors of positions are those of all frames
         flight = GroundFlight(NAMES[:5], OFFSETS_M[:5], frames=3, seed=seed)
         places = places_of(flight, rng)
-        sightings, rotations = [], {}
+        sightings, motions = [], {}
         for row, frame in enumerate(flight.frame_names):
             turn = 2.0 * SD_RAD_S * rng.standard_normal(3)
             sightings += sightings_of(flight, row, np.append(np.zeros(3), turn), rng)
-            rotations[frame] = scene_rotation(flight, row, turn, 0.02 * SD_RAD_S)
+            motions[frame] = motion_by_rates(flight, row, turn, 0.02 * SD_RAD_S)
         # without rates, half of the flights are enough: their deviations are nearly the same
-        for known in ({}, rotations) if seed < 2 else (rotations,):
+        for known in ({}, motions) if seed < 2 else (motions,):
             camera = hovering if known else CAMERA
             poses = orient_frames(
-                flight.frame_names, sightings, places, camera, sd_scale=0.0, rotations=known
+                flight.frame_names, sightings, places, camera, sd_scale=0.0, motions=known
             )
             assert all(found.cov is not None for found in poses)
             sds = with_rates if known else without_rates
@@ -174,13 +175,13 @@ def test_rates_do_not_show_how_the_camera_shifts() -> None:
     for seed in range(4):
         flight = GroundFlight(NAMES[:5], OFFSETS_M[:5], frames=3, seed=seed)
         places = places_of(flight, rng)
-        sightings, rotations = [], {}
+        sightings, motions = [], {}
         for row, frame in enumerate(flight.frame_names):
             motion = SD_RAD_S * np.repeat([29.0, 2.0], 3) * rng.standard_normal(6)
             sightings += sightings_of(flight, row, motion, rng)
-            rotations[frame] = scene_rotation(flight, row, motion[3:], 0.02 * SD_RAD_S)
+            motions[frame] = motion_by_rates(flight, row, motion[3:], 0.02 * SD_RAD_S)
         poses = orient_frames(
-            flight.frame_names, sightings, places, CAMERA, sd_scale=0.0, rotations=rotations
+            flight.frame_names, sightings, places, CAMERA, sd_scale=0.0, motions=motions
         )
         z += [
             error_of(found, CameraPose(flight.centres[row], flight.rotations[row]))
@@ -196,15 +197,15 @@ def test_a_single_ring_is_exposed_at_its_own_row(*, has_rates: bool) -> None:
     rng, z = np.random.default_rng(7), []
     for seed in range(8):
         flight = GroundFlight(NAMES[:4], OFFSETS_M[:4], frames=4, seed=seed)
-        motions = np.repeat([shift_sd_m_s, SD_RAD_S], 3) * rng.standard_normal((4, 6))
-        rotations = {
-            frame: scene_rotation(flight, row, motions[row, 3:], 1e-4)
+        drawn = np.repeat([shift_sd_m_s, SD_RAD_S], 3) * rng.standard_normal((4, 6))
+        motions = {
+            frame: motion_by_rates(flight, row, drawn[row, 3:], 1e-4)
             for row, frame in enumerate(flight.frame_names)
         }
         sightings = []
         for row in range(4):
             names = NAMES[:1] if row == 3 else NAMES[:4]
-            sightings += sightings_of(flight, row, motions[row], rng, names)
+            sightings += sightings_of(flight, row, drawn[row], rng, names)
         places = places_of(flight, rng)
         found = orient_frames(
             flight.frame_names,
@@ -212,11 +213,54 @@ def test_a_single_ring_is_exposed_at_its_own_row(*, has_rates: bool) -> None:
             places,
             CAMERA,
             sd_scale=0.0,
-            rotations=rotations if has_rates else {},
+            motions=motions if has_rates else {},
         )[3]
         assert found.is_by_one_ring
         z.append(error_of(found, CameraPose(flight.centres[3], flight.rotations[3])))
     assert 0.4 < float(np.sqrt(np.mean(np.square(z)))) < 1.2
+
+
+def flown_on(
+    seed: int, speed_m_s: float, *, has_times: bool
+) -> tuple[GroundFlight, list[Sighting], dict[str, TargetPosition]]:
+    """Frames of a camera that flies on steadily, and stated positions."""
+    rng = np.random.default_rng(seed)
+    flight = GroundFlight(NAMES, OFFSETS_M, frames=8, seed=seed)
+    sightings = []
+    for row in range(flight.frames):
+        flight.centres[row] = [0.0, 0.8 * (row - 3.5), 28.0]
+        tilt = rotation_about(0.03 * rng.standard_normal(3))
+        flight.rotations[row] = tilt @ np.diag([1.0, -1.0, -1.0])  # rows are read along the flight
+        motion = np.array([0.0, speed_m_s, 0.0, 0.0, 0.0, 0.0])
+        time_s = 0.8 / speed_m_s * row if has_times else None
+        sightings += [
+            replace(each, time_s=time_s) for each in sightings_of(flight, row, motion, rng)
+        ]
+    return flight, sightings, places_of(flight, rng)
+
+
+def test_poses_and_times_show_a_camera_that_flies_on() -> None:
+    """Without that, the height was off, and a position or the focal length seemed wrong."""
+    flight, sightings, places = flown_on(2, 16.0, has_times=True)
+    poses, motions = orient_moving(flight.frame_names, sightings, places, CAMERA)
+    assert wrong_input(poses, sightings, places, CAMERA, UNSTATED_SCALE_SD, motions) is None
+    z = [
+        error_of(found, CameraPose(flight.centres[row], flight.rotations[row]))
+        for row, found in enumerate(poses)
+    ]
+    assert 0.4 < float(np.sqrt(np.mean(np.square(z)))) < 1.3
+
+
+def test_unknown_motion_may_explain_what_contradicts_a_position() -> None:
+    flight, sightings, places = flown_on(2, 16.0, has_times=False)
+    poses, motions = orient_moving(flight.frame_names, sightings, places, CAMERA)
+    assert not motions
+    found = wrong_input(poses, sightings, places, CAMERA, UNSTATED_SCALE_SD, motions)
+    assert isinstance(found, FastCamera)
+    off_m = places["C"].position_m + np.array([0.0, 0.0, 0.3])
+    places["C"] = replace(places["C"], position_m=off_m)
+    off = wrong_input(poses, sightings, places, CAMERA, UNSTATED_SCALE_SD, motions)
+    assert isinstance(off, WrongPosition)
 
 
 @pytest.mark.parametrize("field", [fields.BOARD, fields.POSTS], ids=["board", "posts"])

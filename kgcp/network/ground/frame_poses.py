@@ -24,8 +24,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import rotation_about
 from kgcp.georef.sighting import Sighting, unmistakable
 from kgcp.georef.target_positions import TargetPosition
-from kgcp.measurement.plate_prior import SceneRotation
-from kgcp.network.ground.point_images import CameraPose, PointImages, Readout
+from kgcp.network.ground.point_images import CameraMotion, CameraPose, PointImages, Readout
 from kgcp.network.ground.pose_adjustment import position_slopes
 from kgcp.network.ground.resection import MIN_MARGIN, MIN_POINTS, NoPoseError, Resection, orient
 from kgcp.targets.plain import AnyTarget
@@ -38,7 +37,7 @@ SD_FOCAL = 0.7
 FOCAL_DETERMINED = 0.05
 """Largest relative standard deviation of a focal length that counts as determined."""
 
-NO_ROTATIONS: Mapping[str, SceneRotation] = MappingProxyType({})
+NO_MOTIONS: Mapping[str, CameraMotion] = MappingProxyType({})
 """Nothing is known of any frame's motion during the readout."""
 
 UNSTATED_SCALE_SD = 0.005
@@ -133,7 +132,7 @@ def orient_frames(
     min_points: int = MIN_POINTS,
     has_free_focal: bool = False,
     sd_scale: float = UNSTATED_SCALE_SD,
-    rotations: Mapping[str, SceneRotation] = NO_ROTATIONS,
+    motions: Mapping[str, CameraMotion] = NO_MOTIONS,
 ) -> list[FramePose]:
     """Orient frames by their static targets, at the moment of the middle row.
 
@@ -153,8 +152,8 @@ def orient_frames(
         Standard deviation of the logarithm of all distances' common scale, as the prints cause it:
         see `print_scale_sd`. The sightings state a common error, too, which includes print and
         calibration. The larger of the two counts.
-    rotations : mapping of str to SceneRotation
-        Known rotations of the scene during the readout, by frame.
+    motions : mapping of str to CameraMotion
+        What is known of the camera's motion during the readout, by frame.
     """
     by_frame: dict[str, list[Sighting]] = {frame: [] for frame in frames}
     static = [each for each in sightings if each.frame in by_frame and each.target in positions]
@@ -171,13 +170,13 @@ def orient_frames(
             reason = _count_words(len(usable), several[frame])
             poses.append(FramePose(frame, names, None, None, (), reason))
             continue
-        images = point_images(usable, positions, sd_scale, camera, rotations.get(frame))
+        images = point_images(usable, positions, sd_scale, camera, motions.get(frame))
         poses.append(
             _by_points(frame, names, images, camera, min_points, has_free_focal=has_free_focal)
         )
     if has_free_focal:
         return poses
-    plates = _plate_attitudes(poses, by_frame, positions, camera, rotations)
+    plates = _plate_attitudes(poses, by_frame, positions, camera, motions)
     return [
         _by_ring(
             pose,
@@ -186,7 +185,7 @@ def orient_frames(
             plates,
             sd_scale,
             camera,
-            rotations.get(pose.frame),
+            motions.get(pose.frame),
         )
         if pose.pose is None and pose.targets
         else pose
@@ -199,7 +198,7 @@ def point_images(
     positions: Mapping[str, TargetPosition],
     sd_scale: float,
     camera: Camera,
-    rotation: SceneRotation | None,
+    motion: CameraMotion | None,
 ) -> PointImages:
     """Return a frame's measured targets as points of known position.
 
@@ -207,7 +206,7 @@ def point_images(
     ----------
     sd_scale : float
         As for `orient_frames`.
-    rotation : SceneRotation or None
+    motion : CameraMotion or None
         As for `Readout.of`.
     """
     no_cov = np.zeros((3, 3))
@@ -229,7 +228,7 @@ def point_images(
         np.where(known, [each.distance_m for each in sightings], np.nan),
         np.array(sds),
         max(sd_scale, float(np.median([_common_share(each) for each in sightings]))),
-        Readout.of(camera, pixels, rotation),
+        Readout.of(camera, pixels, motion),
     )
 
 
@@ -359,7 +358,7 @@ def _plate_attitudes(
     by_frame: Mapping[str, Sequence[Sighting]],
     positions: Mapping[str, TargetPosition],
     camera: Camera,
-    rotations: Mapping[str, SceneRotation],
+    motions: Mapping[str, CameraMotion],
 ) -> dict[str, PlateAttitude]:
     """Return the attitudes of plates, from frames that are oriented by three or more targets."""
     position_covs = {name: place.cov_m2 for name, place in positions.items()}
@@ -367,8 +366,8 @@ def _plate_attitudes(
     for pose in poses:
         for each in by_frame[pose.frame]:
             if each.target in pose.used and _is_unambiguous(each):
-                rotation = rotations.get(pose.frame)
-                sample = _attitude_sample(pose, each, position_covs, camera, rotation)
+                motion = motions.get(pose.frame)
+                sample = _attitude_sample(pose, each, position_covs, camera, motion)
                 if sample is not None:
                     samples.setdefault(each.target, []).append(sample)
     return {
@@ -383,7 +382,7 @@ def _attitude_sample(
     ring: Sighting,
     position_covs: Mapping[str, FloatArray | None],
     camera: Camera,
-    rotation: SceneRotation | None,
+    motion: CameraMotion | None,
 ) -> _AttitudeSample | None:
     """Return the attitude of a ring's plate by a frame; None if a pose or covariance is missing."""
     if frame.pose is None or frame.cov is None or frame.by_positions is None:
@@ -395,7 +394,7 @@ def _attitude_sample(
     by_positions = dict(zip(frame.used, slopes, strict=True))
     cov = frame.cov[3:, 3:] - _rotation_cov(by_positions, position_covs)
     cov = cov + world_from_camera @ ring.pose_cov[3:, 3:] @ world_from_camera.T
-    readout = Readout.of(camera, ring.centre_px[None], rotation)
+    readout = Readout.of(camera, ring.centre_px[None], motion)
     if readout is not None:
         rotation_vector, sd_rad = _rotation_until_row(frame.pose, readout)
         world_from_camera = rotation_about(rotation_vector) @ world_from_camera
@@ -455,7 +454,7 @@ def _by_ring(
     plates: Mapping[str, PlateAttitude],
     sd_scale: float,
     camera: Camera,
-    rotation: SceneRotation | None,
+    motion: CameraMotion | None,
 ) -> FramePose:
     """Return the pose by the best of a frame's rings, or the frame unchanged if there is none.
 
@@ -469,7 +468,7 @@ def _by_ring(
         at_row = _pose_by_ring(each, positions[each.target], plates[each.target], sd_scale)
         if at_row is None:
             continue
-        readout = Readout.of(camera, each.centre_px[None], rotation)
+        readout = Readout.of(camera, each.centre_px[None], motion)
         pose, cov = at_row if readout is None else _at_middle_row(*at_row, readout, each.distance_m)
         agreeing = [
             _agrees(other, positions[other.target], pose, cov)
@@ -499,9 +498,11 @@ def _at_middle_row(
 ) -> tuple[CameraPose, FloatArray]:
     """Return pose and covariance at the middle row, from those at the row of one point."""
     rotation_vector, sd_rad = _rotation_until_row(pose, readout)
-    shift_m = distance_m * readout.sd_shift_rad_s * abs(float(readout.delay_s[0]))
-    by_motion = np.repeat([shift_m, sd_rad], 3) ** 2
-    return pose.moved(np.array([0.0, 0.0, 0.0, *-rotation_vector])), cov + np.diag(by_motion)
+    delay_s = float(readout.delay_s[0])
+    velocity_m_s, sd_m_s = readout.shift(distance_m)
+    by_motion = np.repeat([sd_m_s * abs(delay_s), sd_rad], 3) ** 2
+    until_row = np.concatenate((delay_s * velocity_m_s, rotation_vector))
+    return pose.moved(-until_row), cov + np.diag(by_motion)
 
 
 def _rotation_until_row(pose: CameraPose, readout: Readout) -> tuple[FloatArray, float]:
@@ -511,8 +512,10 @@ def _rotation_until_row(pose: CameraPose, readout: Readout) -> tuple[FloatArray,
     to the scene.
     """
     delay_s = float(readout.delay_s[0])
-    rotation_vector = -delay_s * pose.world_from_camera @ np.array(readout.rotation.velocity_rad_s)
-    return rotation_vector, readout.rotation.sd_rad_s * abs(delay_s)
+    rotation_vector = (
+        -delay_s * pose.world_from_camera @ np.array(readout.motion.rotation.velocity_rad_s)
+    )
+    return rotation_vector, readout.motion.rotation.sd_rad_s * abs(delay_s)
 
 
 def _agrees(

@@ -14,30 +14,47 @@ from kgcp.measurement.plate_prior import SceneRotation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CameraMotion:
+    """What is known of the camera's motion while a rolling shutter reads a frame."""
+
+    rotation: SceneRotation  # of the scene, by the camera's rotation alone
+    # (3,): of the projection centre, in the world; None: unknown, with the standard deviation that
+    # the camera's settings give for the line of sight
+    velocity_m_s: FloatArray | None = None
+    sd_velocity_m_s: float = 0.0  # of each component; no meaning if the velocity is unknown
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Readout:
     """Exposure times of n points by a rolling shutter, and the camera's motion meanwhile."""
 
     delay_s: FloatArray  # (n,): after the middle row, to whose moment the pose refers
-    rotation: SceneRotation  # of the scene, by the camera's rotation alone
+    motion: CameraMotion
     # standard deviation of the apparent rotation of the scene, about each axis, by the camera's
-    # shift, which its rates do not show
+    # shift if its velocity is unknown
     sd_shift_rad_s: float
 
     @classmethod
     def of(
-        cls, camera: Camera, pixels: FloatArray, rotation: SceneRotation | None = None
+        cls, camera: Camera, pixels: FloatArray, motion: CameraMotion | None = None
     ) -> Readout | None:
         """Return the readout of points at raw pixels (n, 2); None: all are exposed at once.
 
         Parameters
         ----------
-        rotation : SceneRotation, optional
-            The scene's rotation by the camera's rates; by default that of the camera's settings.
+        motion : CameraMotion, optional
+            By default that of the camera's settings.
         """
         if not camera.readout_s:
             return None
         unknown = SceneRotation.unknown(camera)
-        return cls(camera.delay_s(pixels), rotation or unknown, unknown.sd_rad_s)
+        return cls(camera.delay_s(pixels), motion or CameraMotion(unknown), unknown.sd_rad_s)
+
+    def shift(self, distance_m: float) -> tuple[FloatArray, float]:
+        """Return velocity (3,) and its standard deviation per axis [m/s], at a mean distance."""
+        if self.motion.velocity_m_s is None:
+            return np.zeros(3), distance_m * self.sd_shift_rad_s
+        return self.motion.velocity_m_s, self.motion.sd_velocity_m_s
 
     def chosen(self, which: BoolArray) -> Readout:
         """Return the readout of some of the points."""
@@ -75,14 +92,23 @@ class PointImages:
             None if self.readout is None else self.readout.chosen(which),
         )
 
-    @property
-    def motion_sd_rad(self) -> FloatArray:
-        """Typical rotation (n,) of each point since the moment of the pose [rad]."""
+    def motion_sd_rad(self, distance_m: FloatArray) -> FloatArray:
+        """Return the typical rotation (..., n) of points since the moment of the pose [rad].
+
+        Parameters
+        ----------
+        distance_m : (..., n) array
+            From the camera.
+        """
         if self.readout is None:
             return np.zeros(len(self))
-        velocity = np.array(self.readout.rotation.velocity_rad_s)
-        sds = self.readout.rotation.sd_rad_s, self.readout.sd_shift_rad_s
-        speed = math.hypot(float(np.linalg.norm(velocity)), max(sds))
+        motion = self.readout.motion
+        turn_rad_s = float(np.linalg.norm(motion.rotation.velocity_rad_s))
+        by_shift_rad_s = np.full_like(distance_m, self.readout.sd_shift_rad_s)
+        if motion.velocity_m_s is not None:
+            by_shift_m_s = np.linalg.norm([*motion.velocity_m_s, motion.sd_velocity_m_s])
+            by_shift_rad_s = by_shift_m_s / distance_m
+        speed = np.hypot(turn_rad_s, np.maximum(motion.rotation.sd_rad_s, by_shift_rad_s))
         return np.asarray(speed * np.abs(self.readout.delay_s))
 
     @property

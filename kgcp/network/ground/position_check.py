@@ -19,10 +19,9 @@ from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, distort_jacobian_b
 from kgcp.geometry.camera import Camera
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition
-from kgcp.measurement.plate_prior import SceneRotation
 from kgcp.measurement.systematic_errors import pose_by_calibration
-from kgcp.network.ground.frame_poses import NO_ROTATIONS, SD_FOCAL, FramePose, point_images
-from kgcp.network.ground.point_images import PointImages
+from kgcp.network.ground.frame_poses import NO_MOTIONS, SD_FOCAL, FramePose, point_images
+from kgcp.network.ground.point_images import CameraMotion, PointImages
 from kgcp.network.ground.pose_adjustment import calibration_slopes, position_equations
 from kgcp.network.ground.target_moves import FrameEquations, MovedTarget, moved_target
 
@@ -36,6 +35,9 @@ _RING_SHARE = 0.01  # radius of a ring whose distance depends on the calibration
 _WRONG_CAMERA_CHI2 = 20.5  # limit of five parameters; chance exceeds it once in 1000 flights
 _MAX_OFF_SDS = 3.0  # by which a wrong calibration displaces cameras that are not reported
 _NAMED_SDS = 4.0  # by which a parameter is off that is named
+# A contradiction may be that of a camera in flight if it vanishes where this many times the stated
+# motion is likely: 40°/s by default, or 20 m/s at 28 m.
+_FASTER = 8.0
 # A-priori standard deviations of a camera that may be any: of its lengths, as a share of the focal
 # length, and of k1.
 _CAMERA_SHARE_SD, _CAMERA_K1_SD = 0.1, 0.3
@@ -80,6 +82,19 @@ class WrongCamera:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class FastCamera:
+    """A contradiction that a camera explains which moves faster than stated during the readout.
+
+    Attributes
+    ----------
+    otherwise : WrongPosition or MovedTarget or WrongCamera
+        What the frames contradict if it does not.
+    """
+
+    otherwise: WrongPosition | MovedTarget | WrongCamera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Equations:
     """Normal equations of corrections to n positions and the calibration, from all frames."""
 
@@ -109,8 +124,8 @@ def wrong_input(
     positions: Mapping[str, TargetPosition],
     camera: Camera,
     sd_scale: float,
-    rotations: Mapping[str, SceneRotation] = NO_ROTATIONS,
-) -> WrongPosition | MovedTarget | WrongCamera | None:
+    motions: Mapping[str, CameraMotion] = NO_MOTIONS,
+) -> WrongPosition | MovedTarget | WrongCamera | FastCamera | None:
     """Return what the frames of a flight contradict most; None: nothing is doubtful.
 
     Parameters
@@ -118,6 +133,30 @@ def wrong_input(
     poses : sequence of FramePose
         Result of `orient_frames` for the other arguments.
     """
+    found = _contradiction(poses, sightings, positions, camera, sd_scale, motions)
+    if found is None or not camera.readout_s:
+        return found
+    # frames that do not know their motion mostly share it, so that all contradict rest alike
+    faster = replace(camera, motion_sd_deg_s=_FASTER * camera.motion_sd_deg_s)
+    velocities = {
+        frame: motion for frame, motion in motions.items() if motion.velocity_m_s is not None
+    }
+    is_explained = (
+        len(velocities) < len(poses)
+        and _contradiction(poses, sightings, positions, faster, sd_scale, velocities) is None
+    )
+    return FastCamera(found) if is_explained else found
+
+
+def _contradiction(
+    poses: Sequence[FramePose],
+    sightings: Sequence[Sighting],
+    positions: Mapping[str, TargetPosition],
+    camera: Camera,
+    sd_scale: float,
+    motions: Mapping[str, CameraMotion],
+) -> WrongPosition | MovedTarget | WrongCamera | None:
+    """Return what the frames contradict most by what is known of the camera's motion."""
     by_frame_and_target = {
         (each.frame, each.target): each for each in sightings if not each.instance
     }
@@ -126,7 +165,7 @@ def wrong_input(
         return None
 
     def equations(of_frames: Sequence[FramePose]) -> _Equations:
-        return _equations(of_frames, by_frame_and_target, positions, camera, sd_scale, rotations)
+        return _equations(of_frames, by_frame_and_target, positions, camera, sd_scale, motions)
 
     agreeing = equations(oriented)
     position: WrongPosition | MovedTarget | None = _wrong_position(agreeing)
@@ -225,7 +264,7 @@ def _equations(
     positions: Mapping[str, TargetPosition],
     camera: Camera,
     sd_scale: float,
-    rotations: Mapping[str, SceneRotation],
+    motions: Mapping[str, CameraMotion],
 ) -> _Equations:
     names = list(dict.fromkeys(name for pose in poses for name in pose.used))
     count = 3 * len(names) + len(_CHECKED)
@@ -237,7 +276,7 @@ def _equations(
             continue
         used = pose.used
         sightings = [by_frame_and_target[pose.frame, name] for name in used]
-        images = point_images(sightings, positions, sd_scale, camera, rotations.get(pose.frame))
+        images = point_images(sightings, positions, sd_scale, camera, motions.get(pose.frame))
         has_free_focal = pose.sd_focal_scale is not None
         by_calibration = _by_calibration(camera, sightings)
         equations = position_equations(

@@ -227,7 +227,7 @@ def _hypothesis_costs(
     mean_cov = np.trace(images.position_cov, axis1=1, axis2=2) / 3.0
     variance = (
         _START_PX**2
-        + images.motion_sd_rad**2 * camera.mean_focal_px**2
+        + images.motion_sd_rad(distance) ** 2 * camera.mean_focal_px**2
         + 0.5 * np.trace(images.pixel_cov, axis1=1, axis2=2)
         + mean_cov * (camera.mean_focal_px / distance) ** 2
     )

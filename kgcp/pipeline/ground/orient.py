@@ -32,8 +32,14 @@ from kgcp.io.tables.poses import (
 )
 from kgcp.io.tables.provenance import derived_provenance, orientation_provenance
 from kgcp.io.tables.staleness import POSES_TABLE
-from kgcp.network.ground.frame_poses import FramePose, orient_frames, print_scale_sd
-from kgcp.network.ground.position_check import WrongCamera, WrongPosition, wrong_input
+from kgcp.network.ground.frame_motions import orient_moving
+from kgcp.network.ground.frame_poses import FramePose, print_scale_sd
+from kgcp.network.ground.position_check import (
+    FastCamera,
+    WrongCamera,
+    WrongPosition,
+    wrong_input,
+)
 from kgcp.network.ground.resection import MIN_POINTS
 from kgcp.network.ground.target_moves import MovedTarget
 from kgcp.network.ground.vehicle_check import VehicleOff, vehicle_off
@@ -77,7 +83,7 @@ class FlightPoses:
     local_frame : LocalFrame
     provenance : mapping of str
         The metadata of the table.
-    wrong_input : WrongPosition or MovedTarget or WrongCamera or None
+    wrong_input : WrongPosition or MovedTarget or WrongCamera or FastCamera or None
         What the images contradict: a position, that a target stayed there, or the calibration;
         None: nothing.
     vehicle_off : VehicleOff or None
@@ -89,7 +95,7 @@ class FlightPoses:
     poses: tuple[FramePose, ...]
     local_frame: LocalFrame
     provenance: Mapping[str, str]
-    wrong_input: WrongPosition | MovedTarget | WrongCamera | None = None
+    wrong_input: WrongPosition | MovedTarget | WrongCamera | FastCamera | None = None
     vehicle_off: VehicleOff | None = None
 
     @property
@@ -171,8 +177,16 @@ class FlightPoses:
             )
         return tuple(doubts)
 
-    def _contradiction(self, wrong: WrongPosition | MovedTarget | WrongCamera) -> str:
+    def _contradiction(self, wrong: WrongPosition | MovedTarget | WrongCamera | FastCamera) -> str:
         """Return the sentence on what the images contradict."""
+        if isinstance(wrong, FastCamera):
+            return (
+                "the camera moves faster than motion_sd_deg_s"
+                f" ({self.flight.camera.motion_sd_deg_s:g}°/s) says while its frames are read out,"
+                f" or {self._suspect(wrong.otherwise)}; poses may be off by more than is stated."
+                " Give the frames' times (eight frames in a row show the motion), or state how fast"
+                " it may be (8 m/s at 30 m is 15°/s), and repeat 'kgcp detect'"
+            )
         if isinstance(wrong, WrongPosition):
             first, *others = wrong.targets
             return (
@@ -205,6 +219,15 @@ class FlightPoses:
                 else "; if its shutter is rolling, give readout_s"
             )
         )
+
+    @staticmethod
+    def _suspect(wrong: WrongPosition | MovedTarget | WrongCamera) -> str:
+        """Return what is wrong if the camera's motion is as stated."""
+        if isinstance(wrong, WrongPosition):
+            return f"the position of {' or '.join(wrong.targets)} is wrong"
+        if isinstance(wrong, MovedTarget):
+            return f"{wrong.target} was moved"
+        return "its calibration is wrong"
 
     @property
     def _targets_counted_as_exact(self) -> list[str]:
@@ -271,9 +294,8 @@ def orient_flight(
     positions = data.target_positions
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
     sd_scale = print_scale_sd(flight.static_targets)
-    rotations = data.scene_rotations
     with np.errstate(all="ignore"):  # trial poses may be absurd; results that are not finite fail
-        poses = orient_frames(
+        poses, motions = orient_moving(
             frames,
             sightings,
             positions.static,
@@ -281,9 +303,9 @@ def orient_flight(
             min_points=options.min_points,
             has_free_focal=options.has_free_focal,
             sd_scale=sd_scale,
-            rotations=rotations,
+            rotations=data.scene_rotations,
         )
-        wrong = wrong_input(poses, sightings, positions.static, flight.camera, sd_scale, rotations)
+        wrong = wrong_input(poses, sightings, positions.static, flight.camera, sd_scale, motions)
         off = None
         if not options.has_free_focal:  # it would change all distances
             on_vehicle = _on_vehicle(sightings, positions, flight.camera)
