@@ -251,6 +251,18 @@ def test_poses_and_times_show_a_camera_that_flies_on() -> None:
     assert 0.4 < float(np.sqrt(np.mean(np.square(z)))) < 1.3
 
 
+def test_poses_far_apart_do_not_show_the_motion() -> None:
+    rng = np.random.default_rng(4)
+    flight = GroundFlight(NAMES[:5], OFFSETS_M[:5], frames=8, seed=4)
+    sightings = [
+        replace(each, time_s=3.0 * row)
+        for row in range(flight.frames)
+        for each in sightings_of(flight, row, drawn_motion(rng), rng)
+    ]
+    _, motions = orient_moving(flight.frame_names, sightings, places_of(flight, rng), CAMERA)
+    assert not motions
+
+
 def test_unknown_motion_may_explain_what_contradicts_a_position() -> None:
     flight, sightings, places = flown_on(2, 16.0, has_times=False)
     poses, motions = orient_moving(flight.frame_names, sightings, places, CAMERA)

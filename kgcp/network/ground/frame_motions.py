@@ -26,6 +26,11 @@ from kgcp.network.ground.resection import MIN_POINTS
 NO_ROTATIONS: Mapping[str, SceneRotation] = MappingProxyType({})
 """No frame's rotation is known."""
 
+# Poses show the motion if the standard deviation of a velocity is below this share of what the
+# camera usually does, or may do a priori.
+_KNOWN_SHARE = 0.5
+_MAX_INTERVAL_S = 1.5  # between frames; a camera that stops for each of them needs longer
+
 
 def orient_moving(
     frames: Sequence[str],
@@ -105,7 +110,8 @@ def _motions_by_poses(
         for pose in poses
         if pose.pose is not None and not pose.is_by_one_ring and pose.frame in time_s
     ]
-    if not camera.readout_s or not posed:
+    times_s = np.unique([time_s[frame] for frame, _ in posed])
+    if not camera.readout_s or len(times_s) < 2 or np.median(np.diff(times_s)) > _MAX_INTERVAL_S:
         return {}
     distance_m = float(np.median([each.distance_m for each in sightings]))
     centre_m = np.array([pose.centre_m for _, pose in posed])
@@ -118,7 +124,10 @@ def _motions_by_poses(
         SceneRotation.unknown(camera),
         distance_m,
     )
-    if not motions.is_observed.any():
+    at_rest = SceneRotation.unknown(camera)
+    usual_m_s = math.sqrt(float(np.mean(motions.velocity_m_s**2)))
+    usual_m_s = max(usual_m_s, at_rest.sd_rad_s * distance_m)
+    if not motions.sd_velocity_m_s.min() < _KNOWN_SHARE * usual_m_s:
         return {}
     # the scene turns opposite to the camera
     turns = -np.einsum("nji,nj->ni", enu_from_camera, motions.turn_rad_s)
@@ -131,9 +140,7 @@ def _motions_by_poses(
         for row, ((frame, _), (x, y, z)) in enumerate(zip(posed, turns.tolist(), strict=True))
     }
     # other frames are read from a camera that is likely as fast
-    usual_m_s = math.sqrt(float(np.mean(motions.velocity_m_s[motions.is_observed] ** 2)))
-    at_rest = SceneRotation.unknown(camera)
-    unknown = CameraMotion(at_rest, np.zeros(3), max(usual_m_s, at_rest.sd_rad_s * distance_m))
+    unknown = CameraMotion(at_rest, np.zeros(3), usual_m_s)
     return {
         pose.frame: known.get(pose.frame)
         or replace(unknown, rotation=rotations.get(pose.frame, at_rest))
