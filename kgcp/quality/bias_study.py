@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -23,6 +23,9 @@ from kgcp.targets.plain import AnyTarget
 # The reference of a frame is vague if its standard deviation exceeds both: this factor times the
 # median, and this length.
 _VAGUE_FACTOR, _VAGUE_M = 10.0, 0.1
+# The motion of a rolling shutter's camera is known if its standard deviation is below this share
+# of the a-priori one.
+_KNOWN_MOTION = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,6 +89,9 @@ class Comparison:
     # (2,): centre in the raw image by the reference pose [px]; NaN behind the camera
     expected_px: FloatArray
     expected_radius_px: float  # outer radius of the main ring by the reference pose [px]
+    # standard deviation of the measured distance by the camera's motion while a rolling shutter
+    # reads the frame, if that is unknown [m]; 0: it is known, or nothing was measured
+    sd_motion_m: float = 0.0
 
     @property
     def reference_distance_m(self) -> float:
@@ -199,7 +205,12 @@ def study_bias(
     places = _camera_places(
         [attempt for attempt, _ in placed], poses, orientations, motions, camera
     )
-    compared, vague = _without_vague(_compare_all(placed, places, camera, targets))
+    row_of = {frame: row for row, frame in enumerate(poses.frames)}
+    pairs = [
+        replace(pair, sd_motion_m=_sd_by_motion(pair, camera, motions, row_of[pair.attempt.frame]))
+        for pair in _compare_all(placed, places, camera, targets)
+    ]
+    compared, vague = _without_vague(pairs)
     measured = tuple(pair for pair in compared if pair.attempt.sighting is not None)
     agree = 2 * sum(pair.is_misplaced for pair in measured) < len(measured)
     return BiasStudy(
@@ -264,6 +275,26 @@ def _compare_all(
         )
         for (attempt, position), place, pixel in zip(placed, places, pixels, strict=True)
     ]
+
+
+def _sd_by_motion(
+    pair: Comparison, camera: Camera, motions: CameraMotions | None, row: int
+) -> float:
+    """Return the standard deviation of a measured distance by an unknown motion [m]; 0: known.
+
+    The stated one includes it. The motion from row to row stretches the ring by this share of its
+    size at most, and the distance with it.
+    """
+    sighting = pair.attempt.sighting
+    if motions is None or sighting is None or sighting.sd_distance_m is None:
+        return 0.0
+    shift_rad_s = float(motions.sd_velocity_m_s[row]) / sighting.distance_m
+    sd_rad_s = math.hypot(float(motions.sd_turn_rad_s[row]), shift_rad_s)
+    if sd_rad_s < _KNOWN_MOTION * math.radians(camera.motion_sd_deg_s):
+        return 0.0
+    per_row_s = abs(camera.readout_s) / (camera.height - 1)
+    share = camera.mean_focal_px * math.radians(camera.motion_sd_deg_s) * per_row_s
+    return min(sighting.sd_distance_m, share * sighting.distance_m)
 
 
 def _without_vague(pairs: Sequence[Comparison]) -> tuple[list[Comparison], tuple[str, ...]]:

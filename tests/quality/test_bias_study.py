@@ -10,13 +10,14 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, ReferencePoses, opk_from_rotation
 from kgcp.geometry.camera import Camera
 from kgcp.georef.exterior_orientation import ExteriorOrientations
-from kgcp.georef.scene_rotation import camera_motions
+from kgcp.georef.scene_rotation import CameraMotions, camera_motions
 from kgcp.georef.sighting import Attempt, Exposure, Sighting
 from kgcp.georef.target_positions import NoPosition, TargetPositions
 from kgcp.georef.trajectory import Trajectory
 from kgcp.measurement.plate_prior import SceneRotation
 from kgcp.quality.bias_study import edge_distances, study_bias
 from kgcp.report.bias.numbers import bias_numbers
+from kgcp.report.bias.verdict import assess
 from kgcp.settings import Method, VehicleSettings
 from kgcp.targets.layout import Ring, Target
 
@@ -244,6 +245,45 @@ def test_distances_from_one_edge_are_displaced_and_from_two_are_not(method: Meth
     assert found is not None
     assert found.by_outer_edge_m == pytest.approx(displaced_m, rel=1e-12)
     assert found.by_both_edges_m == pytest.approx(true_m, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("readout_s", "sd_deg_s", "says"),
+    [
+        (0.03, 5.0, "motion while its frames are read out is unknown and may be the cause"),
+        (0.03, 1.0, "Biased: measured distances are too short"),  # known but for vibration
+        (0.0, None, "Biased: measured distances are too short"),
+    ],
+)
+def test_an_unknown_motion_is_that_of_all_frames(
+    readout_s: float, sd_deg_s: float | None, says: str
+) -> None:
+    """By many frames, its effect seemed to be certain, and right distances biased."""
+    above = np.linspace(20.0, 60.0, 10)
+    motions = None
+    if sd_deg_s is not None:
+        still, sds = np.zeros((10, 3)), np.full(10, np.radians(sd_deg_s))
+        motions = CameraMotions(still, 0.1 * sds, still, sds, np.ones(10, dtype=np.bool_))
+    attempts = []
+    for index, above_m in enumerate(above.tolist()):
+        attempt = _attempt(index, (0.9967 + 1e-4 * (-1) ** index) * above_m, _MIDDLE)
+        assert attempt.sighting is not None
+        sighting = replace(attempt.sighting, sd_distance_m=0.004 * above_m)
+        attempts.append(replace(attempt, sighting=sighting))
+    study = study_bias(
+        attempts,
+        _nadir_poses(above, sd_m=0.005),
+        _TARGET_POSITIONS,
+        replace(_CAMERA, readout_s=readout_s),
+        [_TARGET],
+        _METHOD,
+        motions,
+    )
+    numbers = bias_numbers(study)
+    assert numbers.total.sd_motion_percent == pytest.approx(
+        0.4 if sd_deg_s == 5.0 else 0.0, abs=1e-3
+    )
+    assert any(says in sentence for sentence in assess(numbers).sentences)
 
 
 def test_without_edge_shift_there_are_no_edge_distances() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
@@ -42,22 +42,33 @@ class RangeRow:
     metres: Spread
     # mean standard deviation of the reference distances [%]; None: unknown
     sd_reference_percent: float | None
+    # mean standard deviation by the camera's motion where it is unknown while a rolling shutter
+    # reads frames [%]; 0: it is known
+    sd_motion_percent: float = 0.0
 
     @property
     def sd_mean_percent(self) -> float | None:
-        """Standard deviation of the mean error by its own noise and by the reference [%].
+        """Standard deviation of the mean error by its noise, the reference, and unknown motion [%].
 
         Errors of a trajectory and of reference poses are correlated over many frames, so averaging
-        is not assumed to reduce them.
+        is not assumed to reduce them. A flight mostly has one speed: if it is unknown, its effect
+        is that of all frames.
         """
         noise = self.percent.sd_mean
-        return None if noise is None else math.hypot(noise, self.sd_reference_percent or 0.0)
+        if noise is None:
+            return None
+        return math.hypot(noise, self.sd_reference_percent or 0.0, self.sd_motion_percent)
 
     @property
     def is_biased(self) -> bool:
-        """Whether noise and errors of the reference do not explain the mean error."""
+        """Whether noise, errors of the reference and unknown motion do not explain the mean."""
         sd = self.sd_mean_percent
         return sd is not None and abs(self.percent.mean) > BIASED_SIGMAS * sd
+
+    @property
+    def is_by_motion(self) -> bool:
+        """Whether nothing but unknown motion explains the mean error."""
+        return not self.is_biased and replace(self, sd_motion_percent=0.0).is_biased
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,9 +154,16 @@ class BiasNumbers:
     @property
     def biased(self) -> tuple[RangeRow, ...]:
         """The ranges with a bias: all distances, or else near or far ones."""
-        if self.total.is_biased:
-            return (self.total,)
-        return tuple(half for half in self.halves if half.is_biased)
+        return self._where(lambda row: row.is_biased)
+
+    @property
+    def biased_by_motion(self) -> tuple[RangeRow, ...]:
+        """The ranges whose mean error nothing but unknown motion explains, as `biased`."""
+        return self._where(lambda row: row.is_by_motion)
+
+    def _where(self, holds: Callable[[RangeRow], bool]) -> tuple[RangeRow, ...]:
+        """Return all distances if a condition holds for them, or else near or far ones."""
+        return (self.total,) if holds(self.total) else tuple(filter(holds, self.halves))
 
     @property
     def is_displaced(self) -> bool:
@@ -183,7 +201,8 @@ def bias_numbers(study: BiasStudy) -> BiasNumbers:
         + np.array([sighting.sd_common_distance_m or 0.0 for sighting in measured]) ** 2
         + np.nan_to_num(sd_reference) ** 2
     )
-    total, halves, bins = _range_rows(data.distance_m, data.residual_m, sd_reference)
+    sd_motion = np.array([pair.sd_motion_m for pair in compared])
+    total, halves, bins = _range_rows(data.distance_m, data.residual_m, sd_reference, sd_motion)
     detected = [study.trusts(pair) for pair in study.expected_visible]
     scaled = (data.residual_m / sd)[np.isfinite(sd)]
     stated = sd_reference[np.isfinite(sd_reference)]
@@ -237,7 +256,10 @@ def largest(residual: FloatArray) -> list[int]:
 
 
 def _range_rows(
-    distance_m: FloatArray, residual_m: FloatArray, sd_reference_m: FloatArray
+    distance_m: FloatArray,
+    residual_m: FloatArray,
+    sd_reference_m: FloatArray,
+    sd_motion_m: FloatArray,
 ) -> tuple[RangeRow, tuple[RangeRow, ...], tuple[RangeRow, ...]]:
     """Return the rows over all distances (n,), of near and far, and per 10 m.
 
@@ -253,7 +275,9 @@ def _range_rows(
         relative = 100.0 * sd_reference_m[inside] / distance
         stated = relative[np.isfinite(relative)]
         sd = float(stated.mean()) if stated.size else None
-        return RangeRow(label, Spread.of(100.0 * residual / distance), Spread.of(residual), sd)
+        by_motion = float(np.mean(100.0 * sd_motion_m[inside] / distance))
+        percent = Spread.of(100.0 * residual / distance)
+        return RangeRow(label, percent, Spread.of(residual), sd, by_motion)
 
     total = row("over all distances", 0.0, math.inf)
     if total is None:

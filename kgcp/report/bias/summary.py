@@ -83,6 +83,7 @@ def _range(row: RangeRow) -> Json:
         "residual_percent": asdict(row.percent),
         "residual_m": asdict(row.metres),
         "sd_reference_percent": row.sd_reference_percent,
+        "sd_motion_percent": row.sd_motion_percent,
     }
 
 

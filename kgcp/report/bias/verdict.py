@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from statistics import median
 
+import numpy as np
+
 from kgcp.quality.bias_causes import Term
 from kgcp.quality.checks.doubt import Doubt
 from kgcp.quality.number_text import counted, rounded
@@ -143,16 +145,28 @@ def _rms(row: RangeRow) -> str:
 def _bias(numbers: BiasNumbers) -> Finding:
     if numbers.total.percent.count == 1:
         return Finding(FlightGrade.LOOK, "One frame is not enough to determine a bias.", "error")
-    if not numbers.biased:
-        is_stated = numbers.total.sd_reference_percent is not None
-        beyond = "noise and errors of the reference" if is_stated else "noise"
-        text = f"No bias beyond {beyond}: the mean error is {_mean(numbers.total)}."
-        return Finding(FlightGrade.GOOD, text, "error")
-    sides = [(row, "long" if row.percent.mean > 0.0 else "short") for row in numbers.biased]
-    parts = [f"too {side} ({row.label}), on average by {_mean(row)}" for row, side in sides]
-    material = any(abs(row.percent.mean) >= LIMITS.mean_percent for row in numbers.biased)
-    text = f"Biased: measured distances are {'; '.join(parts)}."
-    return Finding(FlightGrade.LOOK if material else FlightGrade.GOOD, text, "error")
+    is_stated = numbers.total.sd_reference_percent is not None
+    beyond = "noise and errors of the reference" if is_stated else "noise"
+    if numbers.biased:
+        material = any(abs(row.percent.mean) >= LIMITS.mean_percent for row in numbers.biased)
+        text = f"Biased: measured distances are {_sides(numbers.biased)}."
+        return Finding(FlightGrade.LOOK if material else FlightGrade.GOOD, text, "error")
+    if numbers.biased_by_motion:
+        text = (
+            f"Measured distances are {_sides(numbers.biased_by_motion)}, more than {beyond}"
+            " explain. The camera's motion while its frames are read out is unknown and may be the"
+            " cause: give poses and times of frames that follow each other, the camera's rates, or"
+            " a smaller motion_sd_deg_s if it hardly moves."
+        )
+        return Finding(FlightGrade.LOOK, text, "error")
+    text = f"No bias beyond {beyond}: the mean error is {_mean(numbers.total)}."
+    return Finding(FlightGrade.GOOD, text, "error")
+
+
+def _sides(rows: Sequence[RangeRow]) -> str:
+    """Return on which side the mean errors of ranges are, and their sizes."""
+    sides = [(row, "long" if row.percent.mean > 0.0 else "short") for row in rows]
+    return "; ".join(f"too {side} ({row.label}), on average by {_mean(row)}" for row, side in sides)
 
 
 def _contradictions(doubts: Sequence[Doubt], *, agrees: bool) -> Iterator[Finding]:
@@ -175,11 +189,14 @@ def _contradictions(doubts: Sequence[Doubt], *, agrees: bool) -> Iterator[Findin
 
 
 def _mean(row: RangeRow) -> str:
-    """Return a mean error with its noise and the error that the reference can cause."""
+    """Return a mean error with its noise and the errors that all frames may share."""
     text = signed_amount(row.percent.mean, row.percent.sd_mean, "%")
-    if row.sd_reference_percent is None:
-        return text
-    return f"{text} (the reference can cause ± {rounded(row.sd_reference_percent)} %)"
+    shared = []
+    if row.sd_reference_percent is not None:
+        shared.append(f"the reference can cause ± {rounded(row.sd_reference_percent)} %")
+    if row.sd_motion_percent:
+        shared.append(f"unknown motion of the camera ± {rounded(row.sd_motion_percent)} %")
+    return f"{text} ({', '.join(shared)})" if shared else text
 
 
 def _causes(numbers: BiasNumbers) -> Iterator[Finding]:
@@ -195,7 +212,10 @@ def _causes(numbers: BiasNumbers) -> Iterator[Finding]:
             f"{LABELS[term.name]} {value_of(term)}{_possible(term, numbers)}" for term in basic
         )
         is_explained = any(term.is_significant for term in basic)
-        what = "Errors of the reference may explain" if is_explained else "Not significant:"
+        what = "Not significant:"
+        if is_explained:
+            by_motion = " or unknown motion" if numbers.total.sd_motion_percent else ""
+            what = f"Errors of the reference{by_motion} may explain"
         yield Finding(FlightGrade.GOOD, f"{what} {values}.", "causes")
     large = {"scale": 0.01 * LIMITS.scale_percent, "offset_m": LIMITS.offset_m}
     for term in regression.terms:
@@ -219,12 +239,14 @@ def _causes(numbers: BiasNumbers) -> Iterator[Finding]:
 
 
 def _is_beyond_reference(term: Term, numbers: BiasNumbers) -> bool:
-    """Whether neither noise nor errors of the reference explain a term.
+    """Whether neither noise nor errors of the reference nor unknown motion explain a term.
 
     Errors of a trajectory that last as long as the flight look like an offset, and leave no scatter
     by which the regression could tell.
     """
-    sd = math.hypot(term.sd, sd_by_reference(term, numbers) or 0.0)
+    motion = 0.01 * numbers.total.sd_motion_percent  # of the distances
+    by_motion = {"scale": motion, "offset_m": motion * float(np.median(numbers.data.distance_m))}
+    sd = math.hypot(term.sd, sd_by_reference(term, numbers) or 0.0, by_motion.get(term.name, 0.0))
     return term.is_significant and abs(term.value) > BIASED_SIGMAS * sd
 
 
