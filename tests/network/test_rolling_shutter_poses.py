@@ -255,7 +255,7 @@ def test_poses_far_apart_do_not_show_the_motion() -> None:
     rng = np.random.default_rng(4)
     flight = GroundFlight(NAMES[:5], OFFSETS_M[:5], frames=8, seed=4)
     sightings = [
-        replace(each, time_s=3.0 * row)
+        replace(each, time_s=1.0 * row)
         for row in range(flight.frames)
         for each in sightings_of(flight, row, drawn_motion(rng), rng)
     ]

@@ -29,7 +29,9 @@ NO_ROTATIONS: Mapping[str, SceneRotation] = MappingProxyType({})
 # Poses show the motion if the standard deviation of a velocity is below this share of what the
 # camera usually does, or may do a priori.
 _KNOWN_SHARE = 0.5
-_MAX_INTERVAL_S = 1.5  # between frames; a camera that stops for each of them needs longer
+# Between frames: a camera that stops for each of them needs longer, and one that sways turns to and
+# fro in between.
+_MAX_INTERVAL_S = 0.5
 
 
 def orient_moving(
