@@ -22,26 +22,18 @@ from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.image_model.blur import REACH_SIGMAS, Blur
 from kgcp.measurement.image_model.blurred_discs import render
-from kgcp.measurement.image_model.blurred_plate import WhiteShare
+from kgcp.measurement.image_model.blurred_plate import KURTOSIS_STEP, WhiteShare
 from kgcp.measurement.image_model.quadrature import quadrature_for
 from kgcp.measurement.image_model.ray_plate import JACOBIAN_ROWS, PLATE_ROWS
 
 _VIEW_ROWS = 6
-_BLUR_ROWS = slice(4, 7)  # derivatives by the blur
+_SHIFT_ROWS = 3  # the value, and its derivatives by a shift of the disc
 _SLACK_PX = 1.0  # how far the edge may move while the pixels in reach stay the same
 _LEAST_SEMI_AXIS_PX = 0.4
 _FOURTH_CUMULANT_PX4 = -1.0 / 120.0  # of a uniform distribution over a pixel's width
 
 # x, y [px] and the stretch xx, xy, yy [px]
 Geometry = FloatArray
-
-# A point out of focus is a uniform disc, which a Gaussian blurs. If the disc has the share r of the
-# variance, its excess kurtosis is −r². It is taken as a sum of Gaussians with these weights, whose
-# variances are smaller by these parts of r. For straight edges, that is off by 0.0002 of the
-# contrast if r is 0.7, and by 0.001 if it is 0.85 (fitted to r of 0.3 to 0.85). With the kurtosis
-# alone it would be 0.007 and 0.012: at the foot of an edge, the sixth cumulant has as large an
-# effect, and burnt edges show little more than their foot.
-_WEIGHTS, _PARTS = (-0.553, 4.277, -4.029, 1.305), (0.0, 0.4, 0.7, 0.85)
 
 NO_INNER = np.empty((0, 3))
 """`DiscPixels.inner` of a disc: no circles within its edge."""
@@ -81,10 +73,9 @@ class DiscPixels:
         circles[0, 2], circles[1:, :3] = 1.0, inner
         circles[::2, 3], circles[1::2, 3] = (-1.0, 1.0) if is_dark else (1.0, -1.0)
         radii = circles[:, 2]
-        least_px = sharpest_px(blur)
-        if kurtosis:
-            least_px *= math.sqrt(min(factor for _, factor in _defocused(kurtosis)))
-        circles[:, 4] = quadrature_for(smallest * radii / sd_px, largest * radii / least_px)
+        circles[:, 4] = quadrature_for(
+            smallest * radii / sd_px, largest * radii / sharpest_px(blur)
+        )
         reach_px = REACH_SIGMAS * sd_px + _SLACK_PX
         off_px = distances_px(places_px, geometry)
         is_member = off_px <= reach_px if len(inner) else np.abs(off_px) <= reach_px
@@ -104,27 +95,30 @@ class DiscPixels:
         """
         views, inverse = np.empty((_VIEW_ROWS, self.places_px.shape[1])), np.empty(3)
         _meet_disc(geometry, self.places_px, inverse, views)
-        on_disc = self._blurred(views, blur)
+        on_disc = np.zeros((PLATE_ROWS, views.shape[1]))
+        on_disc[0] = self.background
+        render(views, blur.vector, self.circles, self.starts, self.members, on_disc)
+        if self.kurtosis:
+            self._add_kurtosis(views, blur, on_disc)
         members = self.members[: self.starts[1]]  # the same for all circles
         _add_fourth_cumulants(views, inverse, blur.total_covariance, self.circles, members, on_disc)
         slopes = np.empty((JACOBIAN_ROWS, views.shape[1]))
         _carry_slopes(inverse, blur.vector, views, on_disc, slopes)
         return WhiteShare(views[:2], on_disc[0], slopes)
 
-    def _blurred(self, views: FloatArray, blur: Blur) -> FloatArray:
-        """Return the white share with its derivatives on the disc (9, n), as `render` does."""
-        on_disc = np.zeros((PLATE_ROWS, views.shape[1]))
-        on_disc[0] = self.background
-        if not self.kurtosis:
-            render(views, blur.vector, self.circles, self.starts, self.members, on_disc)
-            return on_disc
-        for weight, factor in _defocused(self.kurtosis):
+    def _add_kurtosis(self, views: FloatArray, blur: Blur, on_disc: FloatArray) -> None:
+        """Add the effect of the point spread's kurtosis, as `blurred_plate.kurtosis_row` does.
+
+        It is added to the value and to its derivatives by a shift of the disc, not to those by the
+        blur.
+        """
+        changed = np.zeros_like(on_disc)
+        for factor in (1.0 + KURTOSIS_STEP, 1.0 - KURTOSIS_STEP):
             vector = blur.vector * np.array((factor, factor, factor, 1.0, 1.0))
-            narrower = np.zeros_like(on_disc)
-            render(views, vector, self.circles, self.starts, self.members, narrower)
-            narrower[_BLUR_ROWS] *= factor
-            on_disc += weight * narrower
-        return on_disc
+            render(views, vector, self.circles, self.starts, self.members, changed)
+        changed[0] += 2.0 * self.background
+        changed[:_SHIFT_ROWS] -= 2.0 * on_disc[:_SHIFT_ROWS]
+        on_disc[:_SHIFT_ROWS] += self.kurtosis / (6.0 * KURTOSIS_STEP**2) * changed[:_SHIFT_ROWS]
 
     def shares_within(self, geometry: Geometry, blur: Blur) -> FloatArray:
         """Return the share (k + 1, n) of every pixel that each blurred circle of a ring covers."""
@@ -138,12 +132,6 @@ class DiscPixels:
             reached = np.array([0, end - begin])
             render(views, blur.vector, alone, reached, self.members[begin:end], share)
         return shares[:, 0]
-
-
-def _defocused(kurtosis: float) -> list[tuple[float, float]]:
-    """Return the Gaussians of a point spread: their weights, and their shares of its variance."""
-    share = math.sqrt(-kurtosis)
-    return [(weight, 1.0 - part * share) for weight, part in zip(_WEIGHTS, _PARTS, strict=True)]
 
 
 def semi_axes(geometry: Geometry) -> tuple[float, float]:

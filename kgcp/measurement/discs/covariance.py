@@ -56,9 +56,10 @@ _BY_UNKNOWN_CURVE = 0.15
 # would take that up, but displace centres where the light falls off: by 0.005 px at R 150 px, 1.9
 # deviations.
 _BY_COMPRESSION, _BY_COMPRESSION_OF_BURNT = 0.08, 0.3
-# Out of focus, the point spread is not quite that of the model. Burnt edges, of which only one half
-# is seen, are displaced by that: by 0.04 px with hardly any noise, where the blur is 1.2 px.
-_BY_DEFOCUS_OF_BURNT = 0.035
+# Out of focus, the shape of the point spread is more than a kurtosis. Burnt edges, of which only
+# one half is seen, are displaced by that: by 0.035 to 0.08 px where the blur is 1.2 px
+# (`defocused_clipped`).
+_BY_DEFOCUS_OF_BURNT = 0.04
 # A ring that is measured as a whole tells a displacement of all its edges, and this share of the
 # above is left: 0.007 px of the 0.1 px of an unknown curve. (In simulations, film's curve leaves
 # 0.012 px and sRGB's 0.001 px.) Edges that are nearer to each other than this, in pixels or in
@@ -279,7 +280,7 @@ def _camera_displacement_px(fit: DiscFit) -> float:
     elif free.tone is not Tone.LINEAR:
         by_compression = _BY_COMPRESSION * free.is_compressed
     by_all_px = math.hypot(by_curve, by_compression, by_defocus) * fit.state.blur.mean_sd_px
-    return math.hypot(by_all_px, free.camera_spread_px)
+    return math.hypot(by_all_px, free.curve_spread_px)
 
 
 def _edges_tell_displacement(fit: DiscFit) -> bool:

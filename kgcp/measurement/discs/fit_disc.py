@@ -110,7 +110,7 @@ class DiscUnknowns:
     kurtosis: float = 0.0  # known excess kurtosis of the point spread
     is_curve_unknown: bool = False  # whether the tone curve is learned from discs
     is_compressed: bool = False  # whether the photograph is a JPEG, or was one
-    camera_spread_px: float = 0.0  # by how much curves displace edges that a few discs leave open
+    curve_spread_px: float = 0.0  # by how much curves displace edges that a few discs leave open
 
     @classmethod
     def of(
@@ -124,7 +124,7 @@ class DiscUnknowns:
         kurtosis: float = 0.0,
         is_curve_unknown: bool = False,
         is_compressed: bool = False,
-        camera_spread_px: float = 0.0,
+        curve_spread_px: float = 0.0,
     ) -> DiscUnknowns:
         """Return the unknowns of a disc.
 
@@ -134,7 +134,7 @@ class DiscUnknowns:
             What is learned of tone and sharpening; None: what is known of any camera.
         has_ink_slope : bool
             Whether the darker level has a gradient of its own: large discs.
-        sharpening_px, is_tone_stated, kurtosis, is_curve_unknown, is_compressed, camera_spread_px
+        sharpening_px, is_tone_stated, kurtosis, is_curve_unknown, is_compressed, curve_spread_px
             As the attributes.
         """
         rows = [*_ALWAYS, *_LIGHT]
@@ -162,7 +162,7 @@ class DiscUnknowns:
             kurtosis,
             is_curve_unknown,
             is_compressed,
-            camera_spread_px,
+            curve_spread_px,
         )
 
     def without_ink_slope(self) -> DiscUnknowns:

@@ -7,7 +7,7 @@ complement, so that a step costs no more than one step of every disc.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,18 +47,6 @@ _SHARED = np.array(CAMERA_ROWS)
 # Median of χ² by its degrees of freedom; with none, discs share nothing to contradict each other in
 _MEDIAN_CHI2 = {0: 1.0, 1: 0.455, 4: 3.357}
 
-# The limit is multiplied by this power of the excess by which discs contradict each other. Burnt,
-# sharpened photographs have an excess of 4 to 6; their bends gain up to 1200, stand for what the
-# model lacks, and displace the discs. Film's curve, with an excess of 1 to 1.5, gains 70 to 800 on
-# nine discs (`benchmarks.calibrate.operator`).
-EXCESS_POWER = 3
-# The excess kurtosis of the point spread is tried in steps of 0.2, at most three of them, from 0 (a
-# Gaussian) or from two or four steps below 0 (out of focus), whichever is likeliest. The least is
-# −0.9, that of defocus by six times the lens's own blur.
-_KURTOSIS_STEP, _DEFOCUSED_STEPS, _MOST_KURTOSIS_STEPS = 0.2, (-2.0, -4.0), 3
-_LEAST_STEP = -4.5
-_NEARBY_KURTOSIS, _REFINEMENTS = 0.1, 2  # by which the likeliest is refined, and how often
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointFit:
@@ -77,11 +65,6 @@ class JointFit:
     def shared(self) -> FloatArray:
         """What the discs share (4,)."""
         return np.asarray(self.fits[0].state.vector[_SHARED])
-
-    @property
-    def states(self) -> list[DiscState]:
-        """The parameters of the discs."""
-        return [fit.state for fit in self.fits]
 
     @property
     def excess(self) -> float:
@@ -416,133 +399,3 @@ def _steps(
     if not math.isfinite(promised):
         raise NoFit
     return steps, promised
-
-
-def likeliest_kurtosis(
-    in_focus: JointFit, adjusted: Callable[..., JointFit | None], least_gain: float
-) -> float:
-    """Return the excess kurtosis of the point spread that makes all discs together likeliest.
-
-    It is 0 unless a negative one, that of a camera out of focus, is significantly likelier. A
-    positive one would mean long tails. Discs that another program rendered with jagged edges seem
-    to have 0.6; with it, a focal length of 6673 px was off by 1.0 instead of 0.9 px.
-
-    Parameters
-    ----------
-    in_focus : JointFit
-        Discs without kurtosis, with the likeliest curve.
-    adjusted : callable
-        Adjusts discs, given fits, states, a curve and the σ of a mask; None if that fails.
-    least_gain : float
-        In twice the log-likelihood, times a power of the excess.
-    """
-
-    def at(step: float) -> JointFit | None:
-        if not _LEAST_STEP <= step <= 0.0:
-            return None
-        return _by_kurtosis(in_focus, adjusted, step * _KURTOSIS_STEP)
-
-    begin, first = 0.0, in_focus
-    for step in _DEFOCUSED_STEPS:
-        defocused = at(step)
-        if defocused is not None and defocused.loss < first.loss:
-            begin, first = step, defocused
-    steps, best = likeliest_along(lambda steps: at(begin + steps), first, _MOST_KURTOSIS_STEPS)
-    gain = in_focus.loss - best.loss
-    if gain <= 0.0:
-        return 0.0
-    is_worthy = 2.0 * gain > least_gain * best.excess**EXCESS_POWER
-    return (begin + steps) * _KURTOSIS_STEP if is_worthy else 0.0
-
-
-def refined_kurtosis(
-    kurtosis: float, joint: JointFit, adjusted: Callable[..., JointFit | None]
-) -> tuple[float, float]:
-    """Return the likeliest kurtosis near a given one, and by how much it may displace edges [px].
-
-    The latter is by one standard deviation of the kurtosis. Of burnt edges, only one half is seen,
-    and the kurtosis tells where the other is: by a dozen of them, radii may be off by 0.1 px.
-
-    Parameters
-    ----------
-    joint : JointFit
-        Discs with the given kurtosis.
-    adjusted : callable
-        As for `likeliest_kurtosis`.
-    """
-    spread_px = 0.0
-    for _ in range(_REFINEMENTS):
-        less, best, more = (
-            _by_kurtosis(joint, adjusted, kurtosis + change)
-            for change in (-_NEARBY_KURTOSIS, 0.0, _NEARBY_KURTOSIS)
-        )
-        if less is None or best is None or more is None:
-            break
-        bend = (less.loss + more.loss - 2.0 * best.loss) / _NEARBY_KURTOSIS**2
-        if bend <= 0.0:
-            break
-        px_per_kurtosis = 0.5 * (more.radii_px - less.radii_px) / _NEARBY_KURTOSIS
-        spread_px = math.sqrt(best.excess / bend * float(np.mean(px_per_kurtosis**2)))
-        change = 0.5 * (less.loss - more.loss) / (_NEARBY_KURTOSIS * bend)
-        kurtosis += min(max(change, -_NEARBY_KURTOSIS), _NEARBY_KURTOSIS)
-        kurtosis = min(max(kurtosis, _LEAST_STEP * _KURTOSIS_STEP), -_NEARBY_KURTOSIS)
-    return kurtosis, spread_px
-
-
-def _by_kurtosis(
-    joint: JointFit, adjusted: Callable[..., JointFit | None], kurtosis: float
-) -> JointFit | None:
-    """Return discs adjusted together anew with another kurtosis; None if that fails."""
-    changed, states = [with_kurtosis(fit, kurtosis) for fit in joint.fits], joint.states
-    return adjusted(changed, states, joint.tone, joint.sharpening_px)
-
-
-def with_kurtosis(fit: DiscFit, kurtosis: float) -> DiscFit:
-    """Return a fit whose pixels have a point spread with this kurtosis."""
-    pixels = replace(fit.sample.pixels, kurtosis=kurtosis)
-    return replace(fit, sample=replace(fit.sample, pixels=pixels))
-
-
-def likeliest(joints: Sequence[JointFit]) -> JointFit | None:
-    """Return the likeliest; None if there is none."""
-    return min(joints, key=lambda joint: joint.loss, default=None)
-
-
-def likeliest_along(
-    at: Callable[[float], JointFit | None], first: JointFit, most_steps: int
-) -> tuple[float, JointFit]:
-    """Return the number of steps at which discs are likeliest, and the fit there.
-
-    Steps are taken one by one; a parabola through the best and its neighbours refines the result.
-
-    Parameters
-    ----------
-    at : callable
-        Returns the fit after a number of steps, which need not be whole; None if it fails.
-    first : JointFit
-        The fit after 0 steps.
-    """
-    tried = {0: first}
-    for direction in (1, -1):
-        step = direction
-        while abs(step) <= most_steps:
-            other = at(step)
-            if other is None:
-                break
-            tried[step] = other
-            if other.loss > tried[step - direction].loss:
-                break
-            step += direction
-        if min(tried, key=lambda step: tried[step].loss):  # this was the right direction
-            break
-    best = min(tried, key=lambda step: tried[step].loss)
-    if best - 1 not in tried or best + 1 not in tried:
-        return best, tried[best]
-    before, middle, after = (tried[best + k].loss for k in (-1, 0, 1))
-    bend = before + after - 2.0 * middle
-    if bend > 0.0:
-        least = best + 0.5 * (before - after) / bend
-        between = at(least)
-        if between is not None and between.loss < middle:
-            return least, between
-    return best, tried[best]

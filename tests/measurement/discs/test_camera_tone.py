@@ -201,7 +201,7 @@ def test_a_single_disc_by_a_linear_camera_is_learned_from() -> None:
         learned = learn_tone([[task]], Response.UNKNOWN)
         assert learned.tone is Tone.LINEAR
         assert learned.prior is not None
-        assert 0.0 < learned.spread_px < 0.3
+        assert 0.0 < learned.curve_spread_px < 0.3
 
 
 def test_a_disc_with_a_bad_start_does_not_diverge() -> None:

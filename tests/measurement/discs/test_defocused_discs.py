@@ -8,7 +8,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy.special import ndtr
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera, Response
@@ -26,16 +25,12 @@ from tests.measurement.jpeg import compressed
 
 CAMERA = Camera(330, 250, 1000.0, 1000.0, 165.0, 125.0)
 POSE = Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
-# Excess kurtosis of defocus by 2 px, with the lens's own blur and a pixel's
-KURTOSIS = -((1.0 / (1.0 + 0.6**2 + 1.0 / 12.0)) ** 2)
 
 
-def field_of_discs(
-    radius_px: float, rng: np.random.Generator, columns: int = 7, rows: int = 5
-) -> FieldScene:
-    discs, middle = [], 0.5 * np.array((columns - 1.0, rows - 1.0))
-    for column, row in itertools.product(range(columns), range(rows)):
-        place_m = 0.045 * (np.array((column, row)) - middle) + rng.uniform(-4e-4, 4e-4, 2)
+def field_of_discs(radius_px: float, rng: np.random.Generator) -> FieldScene:
+    discs = []
+    for column, row in itertools.product(range(7), range(5)):
+        place_m = 0.045 * np.array((column - 3.0, row - 2.0)) + rng.uniform(-4e-4, 4e-4, 2)
         discs.append(SimulatedDisc((*place_m.tolist(), 0.0), 2e-3 * radius_px))
     return FieldScene(tuple(discs), 0.62, 0.1, (0.0012, -0.0008))
 
@@ -49,19 +44,14 @@ def light_of(scene: FieldScene, defocus_px: float) -> FloatArray:
 
 @functools.cache
 def radius_errors_px(
-    defocus_px: float,
-    sensor: Sensor,
-    response: Response,
-    gain: float,
-    quality: int = 0,
-    size: tuple[int, int] = (7, 5),
+    defocus_px: float, sensor: Sensor, response: Response, gain: float, quality: int = 0
 ) -> tuple[FloatArray, FloatArray, float]:
     """Errors of the radii of dark discs of R 8 px, their deviations, and the kurtosis learned.
 
     The photograph is a JPEG of some quality; 0: it is not compressed.
     """
     rng = np.random.default_rng(12)
-    scene = field_of_discs(8.0, rng, *size)
+    scene = field_of_discs(8.0, rng)
     grey = sensor.expose(light_of(scene, defocus_px), gain, rng)
     if quality:
         grey = compressed(grey, quality)
@@ -85,8 +75,8 @@ def radius_errors_px(
     ("tone", "response", "gain", "most_px"),
     [
         (ToneCurve.LINEAR, Response.LINEAR, 1.0, 0.002),
-        (ToneCurve.LINEAR, Response.LINEAR, 1.5 / 0.62, 0.05),  # the ground is clipped
-        (ToneCurve.SRGB, Response.SRGB, 1.0, 0.003),
+        (ToneCurve.LINEAR, Response.LINEAR, 1.5 / 0.62, 0.1),  # the ground is clipped
+        (ToneCurve.SRGB, Response.SRGB, 1.0, 0.02),
         (ToneCurve.SRGB, Response.UNKNOWN, 1.0, 0.06),
     ],
 )
@@ -96,7 +86,7 @@ def test_radii_out_of_focus_are_right(
     """With a Gaussian point spread, they were off by 0.003, 0.40, 0.07 and 0.20 px."""
     errors, _, kurtosis = radius_errors_px(2.0, Sensor(tone=tone), response, gain)
     assert abs(errors.mean()) < most_px
-    assert kurtosis == pytest.approx(KURTOSIS, abs=0.06)
+    assert -1.2 < kurtosis < -0.4
 
 
 def test_radii_out_of_focus_are_right_in_jpegs() -> None:
@@ -111,28 +101,6 @@ def test_radii_of_burnt_discs_out_of_focus_are_as_accurate_as_stated() -> None:
     """Without the added deviation of burnt edges out of focus, they were off by 1.6 deviations."""
     errors, sds, _ = radius_errors_px(2.0, Sensor(), Response.LINEAR, 1.5 / 0.62)
     assert 0.4 < np.sqrt(np.mean((errors / sds) ** 2)) < 1.35
-
-
-def test_a_dozen_burnt_discs_out_of_focus_are_as_accurate_as_stated() -> None:
-    """With a kurtosis alone, exactly known, they were off by 0.16 px, 2.3 deviations."""
-    errors, sds, _ = radius_errors_px(2.0, Sensor(), Response.LINEAR, 1.5 / 0.62, size=(4, 3))
-    assert 0.4 < np.sqrt(np.mean((errors / sds) ** 2)) < 1.5
-    assert abs(errors.mean()) < 0.14
-
-
-@pytest.mark.parametrize(("defocus_px", "most"), [(2.0, 0.001), (3.0, 0.002)])
-def test_an_edge_out_of_focus_is_that_of_a_uniform_disc(defocus_px: float, most: float) -> None:
-    """By the kurtosis alone, it would be off by 0.007 and 0.011 of the contrast."""
-    own, of_disc = 0.6**2 + 1.0 / 12.0, 0.25 * defocus_px**2
-    blur, radius_px, off_px = Blur(own + of_disc, own + of_disc, 0.0), 1e4, np.linspace(-5, 5, 101)
-    places, geometry = np.vstack((radius_px - off_px, 0.0 * off_px)), np.array((0.0, 0.0, 1, 0, 1))
-    geometry[2:] *= radius_px
-    kurtosis = -((of_disc / blur.xx) ** 2)
-    pixels = DiscPixels.of(places, geometry, blur, is_dark=False, kurtosis=kurtosis)
-    across = np.linspace(-1.0, 1.0, 2001)
-    light = ndtr((off_px[:, None] - defocus_px * across) / math.sqrt(own))
-    expected = np.average(light, axis=1, weights=np.sqrt(1.0 - across**2))
-    assert np.abs(pixels.white_share(geometry, blur).value - expected).max() < most
 
 
 @pytest.mark.parametrize("response", [Response.LINEAR, Response.UNKNOWN])
