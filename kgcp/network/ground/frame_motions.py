@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 
 import numpy as np
@@ -56,26 +57,20 @@ def orient_moving(
     frames, sightings, positions, camera, min_points, has_free_focal, sd_scale
         As for `orient_frames`.
     """
-    motions: Mapping[str, CameraMotion] = motions_by_rates(rotations)
-
-    def oriented() -> list[FramePose]:
-        return orient_frames(
-            frames,
-            sightings,
-            positions,
-            camera,
-            min_points=min_points,
-            has_free_focal=has_free_focal,
-            sd_scale=sd_scale,
-            motions=motions,
-        )
-
-    poses = oriented()
+    oriented = partial(
+        orient_frames,
+        frames,
+        sightings,
+        positions,
+        camera,
+        min_points=min_points,
+        has_free_focal=has_free_focal,
+        sd_scale=sd_scale,
+    )
+    by_rates = motions_by_rates(rotations)
+    poses = oriented(motions=by_rates)
     by_poses = _motions_by_poses(poses, sightings, camera, rotations)
-    if by_poses:
-        motions = by_poses
-        poses = oriented()
-    return poses, motions
+    return (oriented(motions=by_poses), by_poses) if by_poses else (poses, by_rates)
 
 
 def motions_by_rates(rotations: Mapping[str, SceneRotation]) -> dict[str, CameraMotion]:
