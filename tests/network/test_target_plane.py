@@ -242,18 +242,20 @@ def with_pose_errors(rng: np.random.Generator, factor: float) -> list[CircleView
     sds = np.repeat([0.05, 0.003], 3)  # m, rad
     exact, steps = views_of(circle_of(10.0), rng, frames=12), sds * rng.standard_normal((12, 6))
     turns = np.array([rotation_about(factor * step[3:]) for step in steps])
-    many = []
+    many: list[CircleViews] = []
     for place in ([0.3, -0.2, 0.1], [1.2, 0.4, 0.0], [-0.9, 0.5, 0.2]):
         circle = replace(circle_of(10.0), centre_m=np.array(place))
         moments = circle_images(CAMERA, circle.in_cameras(exact)).moments
         noise = np.linalg.cholesky(exact.cov) @ rng.standard_normal((12, 5, 1))
         many.append(
             CircleViews(
-                exact.camera_m + factor * steps[:, :3],
+                # at the circle's own row, if the shutter is rolling
+                exact.camera_m + factor * steps[:, :3] + 1e-6 * len(many),
                 turns @ exact.world_from_camera,
                 moments + noise[..., 0],
                 exact.cov,
                 np.broadcast_to(np.diag(sds**2), (12, 6, 6)),
+                frames=np.arange(12),
             )
         )
     return many

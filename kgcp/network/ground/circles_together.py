@@ -185,11 +185,11 @@ def _is_by_poses(index: int, many: Sequence[CircleViews], splits: Mapping[int, S
 
 def _is_same_split(views: CircleViews, split: Split, others: CircleViews, other: Split) -> bool:
     """Tell whether two circles seem to move at nearly the same frame by nearly the same offset."""
-    rows = {tuple(place): row for row, place in enumerate(others.camera_m.tolist())}
+    rows = {frame: row for row, frame in enumerate(others.frame_keys)}
     same_side = [
-        (row >= split.first) == (rows[tuple(place)] >= other.first)
-        for row, place in enumerate(views.camera_m.tolist())
-        if tuple(place) in rows
+        (row >= split.first) == (rows[frame] >= other.first)
+        for row, frame in enumerate(views.frame_keys)
+        if frame in rows
     ]
     if (
         not same_side

@@ -21,7 +21,7 @@ from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition
 from kgcp.measurement.plate_prior import SceneRotation
 from kgcp.network.ground.frame_poses import UNSTATED_SCALE_SD, FramePose, orient_frames
-from kgcp.network.ground.point_images import CameraMotion
+from kgcp.network.ground.point_images import CameraMotion, CameraVelocity
 from kgcp.network.ground.resection import MIN_POINTS
 
 NO_ROTATIONS: Mapping[str, SceneRotation] = MappingProxyType({})
@@ -111,6 +111,7 @@ def _motions_by_poses(
     if not camera.readout_s or len(times_s) < 2 or np.median(np.diff(times_s)) > _MAX_INTERVAL_S:
         return {}
     distance_m = float(np.median([each.distance_m for each in sightings]))
+    at_rest = SceneRotation.unknown(camera)
     centre_m = np.array([pose.centre_m for _, pose in posed])
     enu_from_camera = np.array([pose.world_from_camera for _, pose in posed])
     motions = camera_motions(
@@ -118,10 +119,9 @@ def _motions_by_poses(
         centre_m,
         enu_from_camera,
         [rotations.get(frame) for frame, _ in posed],
-        SceneRotation.unknown(camera),
+        at_rest,
         distance_m,
     )
-    at_rest = SceneRotation.unknown(camera)
     usual_m_s = math.sqrt(float(np.mean(motions.velocity_m_s**2)))
     usual_m_s = max(usual_m_s, at_rest.sd_rad_s * distance_m)
     if not motions.sd_velocity_m_s.min() < _KNOWN_SHARE * usual_m_s:
@@ -131,13 +131,12 @@ def _motions_by_poses(
     known = {
         frame: CameraMotion(
             SceneRotation((x, y, z), float(motions.sd_turn_rad_s[row])),
-            motions.velocity_m_s[row],
-            float(motions.sd_velocity_m_s[row]),
+            CameraVelocity(motions.velocity_m_s[row], float(motions.sd_velocity_m_s[row])),
         )
         for row, ((frame, _), (x, y, z)) in enumerate(zip(posed, turns.tolist(), strict=True))
     }
     # other frames are read from a camera that is likely as fast
-    unknown = CameraMotion(at_rest, np.zeros(3), usual_m_s)
+    unknown = CameraMotion(at_rest, CameraVelocity(np.zeros(3), usual_m_s))
     return {
         pose.frame: known.get(pose.frame)
         or replace(unknown, rotation=rotations.get(pose.frame, at_rest))

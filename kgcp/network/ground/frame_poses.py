@@ -499,9 +499,9 @@ def _at_middle_row(
     """Return pose and covariance at the middle row, from those at the row of one point."""
     rotation_vector, sd_rad = _rotation_until_row(pose, readout)
     delay_s = float(readout.delay_s[0])
-    velocity_m_s, sd_m_s = readout.shift(distance_m)
-    by_motion = np.repeat([sd_m_s * abs(delay_s), sd_rad], 3) ** 2
-    until_row = np.concatenate((delay_s * velocity_m_s, rotation_vector))
+    velocity = readout.velocity(distance_m)
+    by_motion = np.repeat([velocity.sd_m_s * abs(delay_s), sd_rad], 3) ** 2
+    until_row = np.concatenate((delay_s * velocity.velocity_m_s, rotation_vector))
     return pose.moved(-until_row), cov + np.diag(by_motion)
 
 

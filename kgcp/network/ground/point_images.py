@@ -14,14 +14,21 @@ from kgcp.measurement.plate_prior import SceneRotation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CameraVelocity:
+    """Velocity of the projection centre while a rolling shutter reads a frame."""
+
+    velocity_m_s: FloatArray  # (3,): in the world
+    sd_m_s: float  # of each component
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class CameraMotion:
     """What is known of the camera's motion while a rolling shutter reads a frame."""
 
     rotation: SceneRotation  # of the scene, by the camera's rotation alone
-    # (3,): of the projection centre, in the world; None: unknown, with the standard deviation that
-    # the camera's settings give for the line of sight
-    velocity_m_s: FloatArray | None = None
-    sd_velocity_m_s: float = 0.0  # of each component; no meaning if the velocity is unknown
+    # None: unknown, with the standard deviation that the camera's settings give for the line of
+    # sight
+    velocity: CameraVelocity | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,11 +57,9 @@ class Readout:
         unknown = SceneRotation.unknown(camera)
         return cls(camera.delay_s(pixels), motion or CameraMotion(unknown), unknown.sd_rad_s)
 
-    def shift(self, distance_m: float) -> tuple[FloatArray, float]:
-        """Return velocity (3,) and its standard deviation per axis [m/s], at a mean distance."""
-        if self.motion.velocity_m_s is None:
-            return np.zeros(3), distance_m * self.sd_shift_rad_s
-        return self.motion.velocity_m_s, self.motion.sd_velocity_m_s
+    def velocity(self, distance_m: float) -> CameraVelocity:
+        """Return the velocity, or the a-priori one for points at a mean distance."""
+        return self.motion.velocity or CameraVelocity(np.zeros(3), distance_m * self.sd_shift_rad_s)
 
     def chosen(self, which: BoolArray) -> Readout:
         """Return the readout of some of the points."""
@@ -105,8 +110,8 @@ class PointImages:
         motion = self.readout.motion
         turn_rad_s = float(np.linalg.norm(motion.rotation.velocity_rad_s))
         by_shift_rad_s = np.full_like(distance_m, self.readout.sd_shift_rad_s)
-        if motion.velocity_m_s is not None:
-            by_shift_m_s = np.linalg.norm([*motion.velocity_m_s, motion.sd_velocity_m_s])
+        if motion.velocity is not None:
+            by_shift_m_s = np.linalg.norm([*motion.velocity.velocity_m_s, motion.velocity.sd_m_s])
             by_shift_rad_s = by_shift_m_s / distance_m
         speed = np.hypot(turn_rad_s, np.maximum(motion.rotation.sd_rad_s, by_shift_rad_s))
         return np.asarray(speed * np.abs(self.readout.delay_s))

@@ -63,12 +63,12 @@ def _linearised(camera: Camera, images: PointImages, pose: CameraPose) -> _Linea
         parts.append(by_motion)
         rotation = images.readout.motion.rotation
         sight_m = float(np.linalg.norm(images.positions_m - pose.centre_m, axis=1).mean())
-        velocity_m_s, sd_shift_m_s = images.readout.shift(sight_m)
-        sds += [max(sd_shift_m_s, sight_m * _MIN_MOTION_SD_RAD_S)] * 3
+        velocity = images.readout.velocity(sight_m)
+        sds += [max(velocity.sd_m_s, sight_m * _MIN_MOTION_SD_RAD_S)] * 3
         sds += [max(rotation.sd_rad_s, _MIN_MOTION_SD_RAD_S)] * 3
         # the camera rotates opposite to the scene
         camera_rad_s = -pose.world_from_camera @ np.array(rotation.velocity_rad_s)
-        residuals = residuals - by_motion @ np.concatenate((velocity_m_s, camera_rad_s))
+        residuals = residuals - by_motion @ np.concatenate((velocity.velocity_m_s, camera_rad_s))
     common = np.concatenate(parts, axis=2) if parts else np.zeros((len(images), 3, 0))
     return _Linearised(residuals, design, by_point, common, np.array(sds) ** -2.0)
 

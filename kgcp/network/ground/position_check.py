@@ -138,9 +138,7 @@ def wrong_input(
         return found
     # frames that do not know their motion mostly share it, so that all contradict rest alike
     faster = replace(camera, motion_sd_deg_s=_FASTER * camera.motion_sd_deg_s)
-    velocities = {
-        frame: motion for frame, motion in motions.items() if motion.velocity_m_s is not None
-    }
+    velocities = {frame: motion for frame, motion in motions.items() if motion.velocity is not None}
     is_explained = (
         len(velocities) < len(poses)
         and _contradiction(poses, sightings, positions, faster, sd_scale, velocities) is None

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.circle_image import Circles3D
 from kgcp.geometry.pose import rotation_about
@@ -28,6 +29,9 @@ class CircleViews:
     # (n, 6, 6): effects on the exterior orientations of six independent errors that are the same in
     # all frames, each with standard deviation 1; `exterior_cov` includes them; None: there are none
     common_effects: FloatArray | None = None
+    # (n,): numbers of the frames, the same for all circles; None: circles that are seen in the same
+    # frame have the same projection centre, which they have not with a rolling shutter
+    frames: IndexArray | None = None
 
     def __len__(self) -> int:
         return len(self.moments)
@@ -41,7 +45,15 @@ class CircleViews:
             self.cov[which],
             None if self.exterior_cov is None else self.exterior_cov[which],
             None if self.common_effects is None else self.common_effects[which],
+            None if self.frames is None else self.frames[which],
         )
+
+    @property
+    def frame_keys(self) -> list[Hashable]:
+        """What tells the frames apart, one by one: equal for all circles of a frame."""
+        if self.frames is not None:
+            return [*self.frames.tolist()]
+        return [tuple(place) for place in self.camera_m.tolist()]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.attitude import ReferencePoses
@@ -230,7 +229,8 @@ def place_targets(
         For a rolling shutter: motion of the camera at each reference pose.
     """
     orientations = ExteriorOrientations.of(poses, local_frame)
-    exterior_cov = None if has_exact_poses else orientations.cov
+    if has_exact_poses:
+        orientations = replace(orientations, cov=None)
     rows = {frame: row for row, frame in enumerate(poses.frames)}
     skipped: dict[str, str] = {}
     usable, all_views, all_frames = [], [], []
@@ -249,11 +249,14 @@ def place_targets(
             orientations.enu_from_camera[at],
             moments,
             cov,
-            None if exterior_cov is None else exterior_cov[at],
+            None if orientations.cov is None else orientations.cov[at],
+            frames=np.array(at),
         )
         usable.append(target)
         all_frames.append(tuple(each.frame for each in posed))
-        all_views.append(views if motions is None else _at_their_rows(camera, views, motions, at))
+        if motions is not None:
+            views = _at_their_rows(camera, views, orientations, motions, at)
+        all_views.append(views)
     outcomes, noise = place_circles(camera, all_views)
     placed = []
     for target, frames, views, outcome in zip(usable, all_frames, all_views, outcomes, strict=True):
@@ -289,7 +292,11 @@ def place_targets(
 
 
 def _at_their_rows(
-    camera: Camera, views: CircleViews, motions: CameraMotions, at: Sequence[int]
+    camera: Camera,
+    views: CircleViews,
+    orientations: ExteriorOrientations,
+    motions: CameraMotions,
+    at: Sequence[int],
 ) -> CircleViews:
     """Return views with the poses of a rolling shutter's camera at the circles' rows.
 
@@ -297,23 +304,20 @@ def _at_their_rows(
     has one speed.
     """
     delay_s = camera.delay_s(views.moments[:, :2])
-    rotation_vectors = delay_s[:, None] * motions.turn_rad_s[at]
-    effects = np.zeros((len(at), 6, 6))
-    sds_m, sds_rad = (
-        delay_s * motions.sd_velocity_m_s[at],
-        delay_s * motions.sd_turn_rad_s[at],
-    )
-    effects[:, :3, :3] = sds_m[:, None, None] * views.world_from_camera
-    effects[:, 3:, 3:] = sds_rad[:, None, None] * views.world_from_camera
-    cov = effects @ np.swapaxes(effects, 1, 2)
+    moved = motions.after(orientations, at, delay_s)
     is_common = ~motions.is_observed[at]
+    effects = np.zeros((len(at), 6, 6))
+    for part, sd in (
+        (slice(0, 3), motions.sd_velocity_m_s[at]),
+        (slice(3, 6), motions.sd_turn_rad_s[at]),
+    ):
+        effects[:, part, part] = (is_common * delay_s * sd)[:, None, None] * views.world_from_camera
     return replace(
         views,
-        camera_m=views.camera_m + delay_s[:, None] * motions.velocity_m_s[at],
-        world_from_camera=Rotation.from_rotvec(rotation_vectors).as_matrix()
-        @ views.world_from_camera,
-        exterior_cov=cov if views.exterior_cov is None else views.exterior_cov + cov,
-        common_effects=effects * is_common[:, None, None] if is_common.any() else None,
+        camera_m=moved.centre_m,
+        world_from_camera=moved.enu_from_camera,
+        exterior_cov=moved.cov,
+        common_effects=effects if is_common.any() else None,
     )
 
 

@@ -12,7 +12,7 @@ distinguish them. Both are adjusted here, and the result includes how much worse
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -238,7 +238,7 @@ def _independent_share(
         The moments that count.
     """
     numbers, squares = 0, 0.0
-    of_frames: dict[tuple[float, ...], FloatArray] = {}
+    of_frames: dict[Hashable, FloatArray] = {}
     for views, fit in placed:
         kept = views.chosen(fit.is_used)
         numbers += kept.moments[:, part].size
@@ -248,8 +248,8 @@ def _independent_share(
         weighted = np.linalg.solve(_stated(camera, kept, fit.circle)[:, part, part], by_exterior)
         shares = np.swapaxes(by_exterior, 1, 2) @ weighted @ np.nan_to_num(kept.exterior_cov)
         squares -= float(np.einsum("npq,nqp->", shares, shares))
-        for place, share in zip(kept.camera_m.tolist(), shares, strict=True):
-            of_frames[tuple(place)] = of_frames.get(tuple(place), np.zeros((6, 6))) + share
+        for frame, share in zip(kept.frame_keys, shares, strict=True):
+            of_frames[frame] = of_frames.get(frame, np.zeros((6, 6))) + share
     squares += sum(float(np.sum(share * share.T)) for share in of_frames.values())
     return numbers / (numbers + squares) if numbers else 1.0
 
