@@ -40,7 +40,10 @@ FULL = Measurement(
     centre_px=np.array([700.25, 401.5]),
     heading_deg=38.5,
     appearance=Appearance(
-        *(41.0, 0.06, 0.81, 0.02),
+        radius_px=41.0,
+        black=0.06,
+        white=0.81,
+        saturated=0.02,
         edge_shift_px=0.11,
         blur_px=0.8,
         inner_growth=0.0012,
