@@ -14,7 +14,6 @@ from kgcp.measurement.discs.affine_model import NO_INNER, DiscPixels, Geometry, 
 from kgcp.measurement.discs.disc_levels import Row
 from kgcp.measurement.discs.fit_disc import (
     CAMERA_ROWS,
-    MUCH_CLIPPED,
     DiscFit,
     DiscSample,
     DiscState,
@@ -76,6 +75,7 @@ class DiscTask:
     inner: FloatArray = field(default_factory=lambda: NO_INNER)  # as in `DiscPixels`
     is_ground_even: bool = True  # False: the ground has a texture
     has_border: bool = False  # whether the ground around it is known to be even
+    smear: tuple[int, int] = (0, 0)  # of the photograph, by `find_smear`
 
     @property
     def is_dark(self) -> bool:
@@ -146,8 +146,8 @@ def adjust_disc(
         if not is_enough:
             raise DiscRejection(DiscReason.CROWDED, "too little free ground")
         state = state or _start(task, window, index, geometry, blur, free)
-        limits = find_censoring(window.levels, window.levels_per_count, window.width)
-        if limits.share > MUCH_CLIPPED:  # a clipped level shows no gradient
+        limits = find_censoring(window.levels, window.levels_per_count, window.width, task.smear)
+        if limits.hides_a_level(window.levels):  # a clipped level shows no gradient
             free = free.without_ink_slope()
         fit = _adjust_on(task, window, limits, index, state, free)
         foreign = foreign_pixels(fit)

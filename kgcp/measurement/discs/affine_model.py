@@ -99,26 +99,36 @@ class DiscPixels:
         on_disc[0] = self.background
         render(views, blur.vector, self.circles, self.starts, self.members, on_disc)
         if self.kurtosis:
-            self._add_kurtosis(views, blur, on_disc)
+            by_kurtosis = self._by_kurtosis(views, blur, on_disc)
+            on_disc[:_SHIFT_ROWS] += self.kurtosis * by_kurtosis
         members = self.members[: self.starts[1]]  # the same for all circles
         _add_fourth_cumulants(views, inverse, blur.total_covariance, self.circles, members, on_disc)
         slopes = np.empty((JACOBIAN_ROWS, views.shape[1]))
         _carry_slopes(inverse, blur.vector, views, on_disc, slopes)
         return WhiteShare(views[:2], on_disc[0], slopes)
 
-    def _add_kurtosis(self, views: FloatArray, blur: Blur, on_disc: FloatArray) -> None:
-        """Add the effect of the point spread's kurtosis, as `blurred_plate.kurtosis_row` does.
+    def by_kurtosis(self, geometry: Geometry, blur: Blur) -> FloatArray:
+        """Return the derivative (n,) of the white share by the point spread's kurtosis."""
+        views, inverse = np.empty((_VIEW_ROWS, self.places_px.shape[1])), np.empty(3)
+        _meet_disc(geometry, self.places_px, inverse, views)
+        on_disc = np.zeros((PLATE_ROWS, views.shape[1]))
+        on_disc[0] = self.background
+        render(views, blur.vector, self.circles, self.starts, self.members, on_disc)
+        return np.asarray(self._by_kurtosis(views, blur, on_disc)[0])
 
-        It is added to the value and to its derivatives by a shift of the disc, not to those by the
-        blur.
+    def _by_kurtosis(self, views: FloatArray, blur: Blur, on_disc: FloatArray) -> FloatArray:
+        """Return the derivative by the point spread's kurtosis, as `blurred_plate.kurtosis_row`.
+
+        It is that of the share, and of its derivatives by a shift of the disc (3, n), without those
+        by the blur. `on_disc` is without kurtosis.
         """
         changed = np.zeros_like(on_disc)
         for factor in (1.0 + KURTOSIS_STEP, 1.0 - KURTOSIS_STEP):
             vector = blur.vector * np.array((factor, factor, factor, 1.0, 1.0))
             render(views, vector, self.circles, self.starts, self.members, changed)
         changed[0] += 2.0 * self.background
-        changed[:_SHIFT_ROWS] -= 2.0 * on_disc[:_SHIFT_ROWS]
-        on_disc[:_SHIFT_ROWS] += self.kurtosis / (6.0 * KURTOSIS_STEP**2) * changed[:_SHIFT_ROWS]
+        difference = changed[:_SHIFT_ROWS] - 2.0 * on_disc[:_SHIFT_ROWS]
+        return np.asarray(difference / (6.0 * KURTOSIS_STEP**2))
 
     def shares_within(self, geometry: Geometry, blur: Blur) -> FloatArray:
         """Return the share (k + 1, n) of every pixel that each blurred circle of a ring covers."""

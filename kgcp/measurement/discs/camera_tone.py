@@ -25,6 +25,7 @@ from kgcp.measurement.discs.adjust_disc import (
     is_in_curved_light,
 )
 from kgcp.measurement.discs.compressed_fit import are_coarse, are_compressed, steps_of
+from kgcp.measurement.discs.covariance import KURTOSIS_SD
 from kgcp.measurement.discs.disc_levels import Row
 from kgcp.measurement.discs.fit_disc import (
     CAMERA_ROWS,
@@ -36,7 +37,13 @@ from kgcp.measurement.discs.fit_disc import (
     NoFit,
     ProcessingPrior,
 )
-from kgcp.measurement.discs.joint_tone import JointFit, adjust_before_compression, adjust_together
+from kgcp.measurement.discs.joint_tone import (
+    JointFit,
+    adjust_before_compression,
+    adjust_together,
+    kurtosis_sd,
+    likeliest_along,
+)
 from kgcp.measurement.discs.tone_curve import WAVES
 from kgcp.measurement.image_model.photometry import Tone
 
@@ -105,6 +112,7 @@ class CameraTone:
     prior: ProcessingPrior | None = None  # of tone curve and sharpening; None: nothing is learned
     blur_px: float = 0.0  # median of the discs that it was learned from; 0: none
     kurtosis: float = 0.0  # excess kurtosis of its point spread
+    kurtosis_sd: float = KURTOSIS_SD  # by how much it may be another
     is_curve_unknown: bool = False  # False: the curve is stated
     # By how much edges may be displaced by curves that a few discs do not tell apart [px]
     curve_spread_px: float = 0.0
@@ -153,11 +161,14 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
         is_curve_unknown=tone is Tone.UNKNOWN,
         is_compressed=is_compressed,
     )
-    if tone is Tone.LINEAR:
-        return camera
     if kurtosis:
         fits = [_with_kurtosis(fit, kurtosis) for fit in fits]
         curves = _by_curves(fits, tone, steps)
+    likeliest = _likeliest(curves.bent or curves.plain)
+    if likeliest is not None:
+        camera = replace(camera, kurtosis_sd=kurtosis_sd(likeliest))
+    if tone is Tone.LINEAR:
+        return camera
     best = _likeliest(
         [
             _with_best_mask(joint, partial(_adjusted_together, sds=sds))
@@ -194,7 +205,7 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
 
 def unknowns_of_disc(task: DiscTask, camera: CameraTone) -> DiscUnknowns:
     """Return the unknowns of a disc, with what is known of the camera."""
-    return DiscUnknowns.of(
+    unknowns = DiscUnknowns.of(
         camera.tone,
         camera.prior,
         sharpening_px=camera.sharpening_px,
@@ -204,6 +215,7 @@ def unknowns_of_disc(task: DiscTask, camera: CameraTone) -> DiscUnknowns:
         is_compressed=camera.is_compressed,
         curve_spread_px=camera.curve_spread_px,
     )
+    return replace(unknowns, kurtosis_sd=camera.kurtosis_sd)
 
 
 def first_blur_px(task: DiscTask, camera: CameraTone) -> float:
@@ -350,7 +362,7 @@ def _likeliest_kurtosis(
         defocused = at(step)
         if defocused is not None and defocused.loss < first.loss:
             begin, first = step, defocused
-    steps, best = _likeliest_along(lambda steps: at(begin + steps), first, _MOST_KURTOSIS_STEPS)
+    steps, best = likeliest_along(lambda steps: at(begin + steps), first, _MOST_KURTOSIS_STEPS)
     gain = in_focus.loss - best.loss
     if gain <= 0.0:
         return 0.0
@@ -479,48 +491,8 @@ def _with_best_mask(joint: JointFit, adjusted: Callable[..., JointFit | None]) -
         return adjusted(joint.fits, states, joint.tone, _MASK_STEP**step * SHARPENING_PX)
 
     # anew also for step 0, since the mask uses the states for the pixels that are not adjusted
-    _, best = _likeliest_along(at, at(0) or joint, _MOST_STEPS)
+    _, best = likeliest_along(at, at(0) or joint, _MOST_STEPS)
     return best
-
-
-def _likeliest_along(
-    at: Callable[[float], JointFit | None], first: JointFit, most_steps: int
-) -> tuple[float, JointFit]:
-    """Return the number of steps at which discs are likeliest, and the fit there.
-
-    Steps are taken one by one; a parabola through the best and its neighbours refines the result.
-
-    Parameters
-    ----------
-    at : callable
-        Returns the fit after a number of steps, which need not be whole; None if it fails.
-    first : JointFit
-        The fit after 0 steps.
-    """
-    tried = {0: first}
-    for direction in (1, -1):
-        step = direction
-        while abs(step) <= most_steps:
-            other = at(step)
-            if other is None:
-                break
-            tried[step] = other
-            if other.loss > tried[step - direction].loss:
-                break
-            step += direction
-        if min(tried, key=lambda step: tried[step].loss):  # this was the right direction
-            break
-    best = min(tried, key=lambda step: tried[step].loss)
-    if best - 1 not in tried or best + 1 not in tried:
-        return best, tried[best]
-    before, middle, after = (tried[best + k].loss for k in (-1, 0, 1))
-    bend = before + after - 2.0 * middle
-    if bend > 0.0:
-        least = best + 0.5 * (before - after) / bend
-        between = at(least)
-        if between is not None and between.loss < middle:
-            return least, between
-    return best, tried[best]
 
 
 def _before_compression(bent: JointFit, steps: Sequence[FloatArray | None]) -> JointFit | None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import ndtri
@@ -48,18 +48,19 @@ _EXTRAPOLATED_SHARE = 0.025
 # shares of the blur. They are from the named cases of `benchmarks.calibrate.operator`.
 #
 # An unknown curve has more than three parameters can describe. It displaces edges by 0.05 to 0.13
-# px where the blur is 0.67 px (`unknown_film`). That also counts if the discs are too few to show
-# whether the curve is bent.
-_BY_UNKNOWN_CURVE = 0.15
+# px where the blur is 0.67 px (`unknown_film`), and by 0.2 px where white is burnt
+# (`unknown_clipped_film`). That also counts if the discs are too few to show whether the curve is
+# bent.
+_BY_UNKNOWN_CURVE, _BY_UNKNOWN_CURVE_OF_BURNT = 0.15, 0.3
 # Compression of quality 92 and 85 displaces edges by 0.02 to 0.06 px, and where white is burnt by
-# 0.05 and 0.18 px (`srgb_jpeg`, `clipped_jpeg`). If the curve could bend in each disc instead, it
+# 0.05 and 0.18 px (`srgb_jpeg`, `clipped_jpeg`). Burnt and with an unknown curve, it is 0.5 px
+# (`unknown_clipped_jpeg`, quality 92). If the curve could bend in each disc instead, it
 # would take that up, but displace centres where the light falls off: by 0.005 px at R 150 px, 1.9
 # deviations.
-_BY_COMPRESSION, _BY_COMPRESSION_OF_BURNT = 0.08, 0.3
-# Out of focus, the shape of the point spread is more than a kurtosis. Burnt edges, of which only
-# one half is seen, are displaced by that: by 0.035 to 0.08 px where the blur is 1.2 px
-# (`defocused_clipped`).
-_BY_DEFOCUS_OF_BURNT = 0.04
+_BY_COMPRESSION, _BY_COMPRESSION_OF_BURNT, _BY_BOTH_OF_BURNT = 0.08, 0.3, 0.7
+# Burnt discs whose radius is less than this many times the blur do not tell size from brightness:
+# at R 3 px, out of focus by 2 px, edges are displaced by 0.35 px (`defocused_clipped`).
+_FEW_BLURS, _BY_BLUR_OF_BURNT = 3.0, 0.3
 # A ring that is measured as a whole tells a displacement of all its edges, and this share of the
 # above is left: 0.007 px of the 0.1 px of an unknown curve. (In simulations, film's curve leaves
 # 0.012 px and sRGB's 0.001 px.) Edges that are nearer to each other than this, in pixels or in
@@ -73,6 +74,9 @@ _WIDE_GAP_PX = 4.0
 # over one radius. In ten draws of photographs, the displacement that discs had in common was half
 # of this (R 8 and 15 px), and twice this in one case of twelve.
 _BY_CURVE_PER_FALL = 0.05
+KURTOSIS_SD = 0.3
+"""Standard deviation of the excess kurtosis of any camera's point spread."""
+_SMALL_SHARE = 1e-3  # of the white share's change, for a numerical derivative
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,11 +133,14 @@ def scatter_of(adjusted: DiscFit | CompressedFit) -> DiscScatter:
     if _edges_tell_displacement(fit):  # `RingUnknowns` allows for the displacement itself
         share = _SHARE_LEFT_OF_RING * max(_WIDE_GAP_PX / _gap_px(fit), 1.0)
         common_px = max(_FLOOR_PX, share * _camera_displacement_px(fit))
+        by_point_spread = np.zeros(GEOMETRY_COUNT)
     else:
         common_px = common_displacement_px(fit)
+        by_point_spread = _displacement_by_point_spread(fit, own)
     # an edge that is displaced everywhere alike changes M by a multiple of the identity
     grown = np.array((0.0, 0.0, 1.0, 0.0, 1.0)) * common_px
     common = np.outer(grown, grown) + np.diag([_FLOOR_PX**2] * GEOMETRY_COUNT)
+    common += np.outer(by_point_spread, by_point_spread)
     if fit.free.tone.is_shaped:
         by_curve_px = _BY_CURVE_PER_FALL * fit.state.blur.mean_sd_px * fit.state.slope
         common[:2, :2] += np.outer(by_curve_px, by_curve_px)
@@ -248,20 +255,25 @@ def common_displacement_px(fit: DiscFit) -> float:
     the clipped part. The camera's displacement counts, too.
     """
     noise, blur_px = fit.noise, fit.state.blur.mean_sd_px
-    state, tone, limits = fit.state, fit.free.tone, fit.sample.censoring
+    limits = fit.sample.censoring
     is_edge = (fit.share > 0.2) & (fit.share < 0.8) & ~limits.is_clipped
     chance = np.array(_PIXEL_VARIANCE / max(int(np.count_nonzero(is_edge)), 1))
     excess = beyond_chance((noise.sd / noise.plateau_sd) ** 2 - 1.0, chance) * noise.plateau_sd**2
     at_edges = median_at_edges(excess, fit.share, 0.3, 0.7, 0.0)
-    black, white = state.plateaus(tone)
+    black, white = fit.state.plateaus(fit.free.tone)
     slope_per_px = (white - black) / (math.sqrt(2.0 * math.pi) * blur_px)
-    at_high, at_low = state.share_at(limits.high, tone), state.share_at(limits.low, tone)
-    hidden = max(0.5 - at_high, at_low - 0.5, 0.0)
-    reach_px = blur_px * float(ndtri(min(0.5 + hidden, 1.0 - 1e-3)))
+    reach_px = blur_px * float(ndtri(min(0.5 + _hidden_share(fit), 1.0 - 1e-3)))
     by_scatter_px = _COMMON_SHARE * math.sqrt(max(at_edges, 0.0)) / slope_per_px
     return max(
         _FLOOR_PX, _EXTRAPOLATED_SHARE * reach_px, by_scatter_px, _camera_displacement_px(fit)
     )
+
+
+def _hidden_share(fit: DiscFit) -> float:
+    """Return how much of the contrast is clipped beyond the middle of the edge; 0: it is seen."""
+    state, tone, limits = fit.state, fit.free.tone, fit.sample.censoring
+    at_high, at_low = state.share_at(limits.high, tone), state.share_at(limits.low, tone)
+    return max(0.5 - at_high, at_low - 0.5, 0.0)
 
 
 def _camera_displacement_px(fit: DiscFit) -> float:
@@ -272,15 +284,55 @@ def _camera_displacement_px(fit: DiscFit) -> float:
     """
     free, limits = fit.free, fit.sample.censoring
     by_curve = _BY_UNKNOWN_CURVE if free.is_curve_unknown else 0.0
-    by_compression = by_defocus = 0.0
+    by_compression = by_blur = 0.0
+    blur_px = fit.state.blur.mean_sd_px
     if fit.sample.is_burnt:
-        by_defocus = _BY_DEFOCUS_OF_BURNT if free.kurtosis else 0.0
-        is_smeared = math.isfinite(limits.ceiling) or math.isfinite(limits.floor)
-        by_compression = _BY_COMPRESSION_OF_BURNT * (free.is_compressed or is_smeared)
+        by_curve = _BY_UNKNOWN_CURVE_OF_BURNT if free.is_curve_unknown else 0.0
+        if free.is_compressed or math.isfinite(limits.ceiling) or math.isfinite(limits.floor):
+            by_compression = _BY_BOTH_OF_BURNT if by_curve else _BY_COMPRESSION_OF_BURNT
+        if mean_radius_px(fit.state.geometry) < _FEW_BLURS * blur_px:
+            by_blur = _BY_BLUR_OF_BURNT
     elif free.tone is not Tone.LINEAR:
         by_compression = _BY_COMPRESSION * free.is_compressed
-    by_all_px = math.hypot(by_curve, by_compression, by_defocus) * fit.state.blur.mean_sd_px
-    return math.hypot(by_all_px, free.curve_spread_px)
+    return math.hypot(math.hypot(by_curve, by_compression, by_blur) * blur_px, free.curve_spread_px)
+
+
+def _displacement_by_point_spread(fit: DiscFit, own: FloatArray) -> FloatArray:
+    """Return one standard deviation of the ellipse (5,) by the shape of the point spread [px].
+
+    An edge that is seen as a whole hardly depends on it. Of a burnt edge only the foot is seen, and
+    the point spread tells where its middle is.
+
+    Parameters
+    ----------
+    own : (5, p) array
+        Rows of the ellipse in the inverse of the normal matrix.
+    """
+    if not fit.sample.is_burnt:
+        return np.zeros(GEOMETRY_COUNT)
+    by_kurtosis = levels_by_kurtosis(fit) / fit.sd
+    moved = own @ (fit.scaled @ (fit.misfit.weight * by_kurtosis))
+    sd = fit.free.kurtosis_sd
+    if _hidden_share(fit):
+        # what is seen is no more than the foot, by which a kurtosis is found too small by half
+        sd = max(sd, KURTOSIS_SD + abs(fit.free.kurtosis))
+    return np.asarray(moved * sd)
+
+
+def levels_by_kurtosis(fit: DiscFit) -> FloatArray:
+    """Return the derivative (n,) of the grey values by the excess kurtosis of the point spread."""
+    by_kurtosis = fit.sample.pixels.by_kurtosis(fit.state.geometry, fit.state.blur)
+    changed = levels_changed(fit, _SMALL_SHARE * by_kurtosis[None])[0]
+    return np.asarray(changed / _SMALL_SHARE)
+
+
+def levels_changed(fit: DiscFit, changes: FloatArray) -> FloatArray:
+    """Return the changes (k, n) of the grey values for some changes (k, n) of the white share."""
+    pixels, state = fit.sample.pixels, fit.state
+    share = pixels.white_share(state.geometry, state.blur)
+    changed = [replace(share, value=share.value + change) for change in changes]
+    levels = [fit.sample.level_model.linearised(each, state.vector)[0] for each in changed]
+    return np.array(levels) - fit.levels
 
 
 def _edges_tell_displacement(fit: DiscFit) -> bool:

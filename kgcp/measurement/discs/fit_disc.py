@@ -27,7 +27,6 @@ from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.image_model.sharpening import Mask, unsharp_mask
 from kgcp.measurement.image_model.srgb import srgb_decoded, srgb_slope
 
-MUCH_CLIPPED = 0.05  # largest share of clipped pixels at which both levels are well seen
 SHARPENING_PX = 1.0  # σ of a camera's unsharp mask, until it is learned
 _MIN_VARIANCE_PX2 = 0.075  # a pixel alone spreads by 1/12 px²
 _MAX_ANISOTROPY = 0.95
@@ -111,6 +110,7 @@ class DiscUnknowns:
     is_curve_unknown: bool = False  # whether the tone curve is learned from discs
     is_compressed: bool = False  # whether the photograph is a JPEG, or was one
     curve_spread_px: float = 0.0  # by how much curves displace edges that a few discs leave open
+    kurtosis_sd: float = 0.0  # by how much it may be another
 
     @classmethod
     def of(
@@ -159,10 +159,10 @@ class DiscUnknowns:
             mean,
             precision,
             is_tone_stated,
-            kurtosis,
-            is_curve_unknown,
-            is_compressed,
-            curve_spread_px,
+            kurtosis=kurtosis,
+            is_curve_unknown=is_curve_unknown,
+            is_compressed=is_compressed,
+            curve_spread_px=curve_spread_px,
         )
 
     def without_ink_slope(self) -> DiscUnknowns:
@@ -339,7 +339,7 @@ class DiscSample:
     @property
     def is_burnt(self) -> bool:
         """Whether a level is clipped, and so hardly seen."""
-        return self.censoring.share > MUCH_CLIPPED
+        return self.censoring.hides_a_level(self.levels)
 
     def unknowns(self, free: DiscUnknowns) -> DiscUnknowns:
         """Return the unknowns of any disc with the priors of this one."""

@@ -7,7 +7,7 @@ complement, so that a step costs no more than one step of every disc.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +20,7 @@ from kgcp.measurement.discs.compressed_fit import (
     noise_before_compression,
     pixels_before_compression,
 )
+from kgcp.measurement.discs.covariance import KURTOSIS_SD, levels_by_kurtosis
 from kgcp.measurement.discs.disc_levels import COUNT
 from kgcp.measurement.discs.fit_disc import (
     CAMERA_ROWS,
@@ -44,6 +45,9 @@ _COMPRESSION_ROUNDS, _SETTLED_NOISE, _SETTLED = 40, 0.05, 0.003
 _LEAST_PROMISE = 0.1  # a step that promises a smaller gain in log-likelihood is not taken
 _DAMPING, _DAMPED, _MOST_DAMPING = 1e-6, 1e-3, 1e3
 _SHARED = np.array(CAMERA_ROWS)
+# The point spread of a lens out of focus is more than a kurtosis. The rest displaces burnt edges
+# like this share of the kurtosis.
+_UNSEEN_OF_KURTOSIS = 0.3
 # Median of χ² by its degrees of freedom; with none, discs share nothing to contradict each other in
 _MEDIAN_CHI2 = {0: 1.0, 1: 0.455, 4: 3.357}
 
@@ -327,6 +331,72 @@ def _reduced(fits: Sequence[DiscFit], damping: float) -> _Reduced:
         between,
         own_gradients,
     )
+
+
+def likeliest_along(
+    at: Callable[[float], JointFit | None], first: JointFit, most_steps: int
+) -> tuple[float, JointFit]:
+    """Return the number of steps at which discs are likeliest, and the fit there.
+
+    Steps are taken one by one; a parabola through the best and its neighbours refines the result.
+
+    Parameters
+    ----------
+    at : callable
+        Returns the fit after a number of steps, which need not be whole; None if it fails.
+    first : JointFit
+        The fit after 0 steps.
+    """
+    tried = {0: first}
+    for direction in (1, -1):
+        step = direction
+        while abs(step) <= most_steps:
+            other = at(step)
+            if other is None:
+                break
+            tried[step] = other
+            if other.loss > tried[step - direction].loss:
+                break
+            step += direction
+        if min(tried, key=lambda step: tried[step].loss):  # this was the right direction
+            break
+    best = min(tried, key=lambda step: tried[step].loss)
+    if best - 1 not in tried or best + 1 not in tried:
+        return best, tried[best]
+    before, middle, after = (tried[best + k].loss for k in (-1, 0, 1))
+    bend = before + after - 2.0 * middle
+    if bend > 0.0:
+        least = best + 0.5 * (before - after) / bend
+        between = at(least)
+        if between is not None and between.loss < middle:
+            return least, between
+    return best, tried[best]
+
+
+def kurtosis_sd(joint: JointFit) -> float:
+    """Return by how much the excess kurtosis of the point spread may be another than that used.
+
+    It is the root of the mean square for the discs that were adjusted together, by one step from
+    the kurtosis used, and with what is known of any camera.
+    """
+    reduced, usual = _reduced(joint.fits, 0.0), ProcessingPrior.usual()
+    own = np.isin(_SHARED, joint.fits[0].free.rows)
+    normal = usual.precision[np.ix_(own, own)] + reduced.normals.sum(axis=0)
+    information, score, with_shared = 0.0, 0.0, np.zeros(np.count_nonzero(own))
+    for fit, inverse, between in zip(
+        joint.fits, reduced.inverse_others, reduced.between, strict=True
+    ):
+        slopes = levels_by_kurtosis(fit) / fit.sd
+        terms = fit.scaled @ (fit.misfit.weight * slopes)
+        shared, others = terms[reduced.is_shared], terms[~reduced.is_shared]
+        information += float(fit.misfit.weight @ slopes**2 - others @ inverse @ others)
+        with_shared += shared - between @ inverse @ others
+        score += float(slopes @ fit.misfit.score)
+    information -= float(with_shared @ np.linalg.solve(normal, with_shared))
+    precision = information / joint.excess + KURTOSIS_SD**-2
+    off = score / joint.excess / precision
+    kurtosis = joint.fits[0].sample.pixels.kurtosis
+    return math.hypot(off, precision**-0.5, _UNSEEN_OF_KURTOSIS * kurtosis)
 
 
 def within_limits(step: FloatArray, normal: FloatArray, now: FloatArray, tone: Tone) -> FloatArray:

@@ -38,6 +38,7 @@ from kgcp.measurement.discs.covariance import (
 )
 from kgcp.measurement.discs.fit_disc import DiscFit, NoFit
 from kgcp.measurement.discs.outlines import tree_of
+from kgcp.measurement.discs.pixel_choice import cut_disc_window
 from kgcp.measurement.discs.records import (
     Disc,
     DiscMiss,
@@ -50,12 +51,14 @@ from kgcp.measurement.discs.records import (
 from kgcp.measurement.discs.ring_unknowns import RingUnknowns
 from kgcp.measurement.discs.textured_ground import fit_on_texture
 from kgcp.measurement.image_model.compression import quantisation_steps
+from kgcp.measurement.image_model.noise import find_smear
 
 _Result = TypeVar("_Result")
 
 _LARGEST_SD_PX = 1.0  # of the centre, and of the moments divided by the radius
 # A disc's window reaches no farther beyond its outline than the smaller of these
 _NEIGHBOUR_RADII, _NEIGHBOUR_PX = 4.0, 40.0
+_DISCS_OF_SMEAR, _BESIDE_PX = 100, 4.0  # that tell smeared pixels, with their surroundings
 
 
 def measure_discs(
@@ -145,13 +148,22 @@ def measure_disc(
 
 
 def _tasks(grey: GreyArray, outlines: Sequence[DiscOutline], ground: float) -> list[DiscTask]:
-    tasks = []
+    tasks, smear = [], _smear_of(grey, outlines)
     for outline, near in zip(outlines, _neighbours(outlines), strict=True):
         others = _others(outline, [outlines[j] for j in near])
         if math.isfinite(ground):
             others.append(outline_geometry(outline) * np.array((1.0, 1.0, *[ground] * 3)))
-        tasks.append(DiscTask(grey, outline, others))
+        tasks.append(DiscTask(grey, outline, others, smear=smear))
     return tasks
+
+
+def _smear_of(grey: GreyArray, outlines: Sequence[DiscOutline]) -> tuple[int, int]:
+    """Return over how many grey values clipped pixels are smeared, by `find_smear`."""
+    some = outlines[:: max(len(outlines) // _DISCS_OF_SMEAR, 1)]
+    windows = [cut_disc_window(grey, outline_geometry(each), _BESIDE_PX) for each in some]
+    if not windows:
+        return 0, 0
+    return find_smear([(each.levels, each.width) for each in windows], windows[0].levels_per_count)
 
 
 def _measured(

@@ -20,7 +20,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.discs.affine_model import Geometry, mean_radius_px
-from kgcp.measurement.discs.covariance import common_displacement_px
+from kgcp.measurement.discs.covariance import common_displacement_px, levels_changed
 from kgcp.measurement.discs.disc_levels import GEOMETRY_COUNT
 from kgcp.measurement.discs.fit_disc import DiscFit, DiscState
 
@@ -53,7 +53,7 @@ class RingUnknowns:
     def of(cls, fit: DiscFit) -> RingUnknowns:
         """Linearise at an adjusted ring."""
         changes = np.array([_STEP * _share_by_ratio(fit), _change_by_width(fit)])
-        slopes = _levels_changed(fit, changes) / (_STEP * fit.sd)
+        slopes = levels_changed(fit, changes) / (_STEP * fit.sd)
         shared = fit.scaled @ (fit.misfit.weight * slopes).T
         by_both = np.linalg.solve(fit.normal, shared)
         information = (fit.misfit.weight * slopes) @ slopes.T - shared.T @ by_both
@@ -96,12 +96,3 @@ def _change_by_width(fit: DiscFit) -> FloatArray:
     circles[1::2, 2] -= _STEP
     wider = replace(pixels, circles=circles).white_share(state.geometry, state.blur)
     return wider.value - fit.share
-
-
-def _levels_changed(fit: DiscFit, changes: FloatArray) -> FloatArray:
-    """Return the changes (k, n) of the grey values for some changes (k, n) of the white share."""
-    pixels, state = fit.sample.pixels, fit.state
-    share = pixels.white_share(state.geometry, state.blur)
-    changed = [replace(share, value=share.value + change) for change in changes]
-    levels = [fit.sample.level_model.linearised(each, state.vector)[0] for each in changed]
-    return np.array(levels) - fit.levels

@@ -12,6 +12,7 @@ from kgcp.measurement.image_model.noise import (
     Censoring,
     estimate_noise,
     find_censoring,
+    find_smear,
     misfit,
     outlier_share,
 )
@@ -272,6 +273,24 @@ def test_pixels_smeared_by_compression_count_as_clipped(*, burnt: bool, flat: in
     assert at_end[800:1300].mean() < 0.04
     assert not at_end[1300:2100].any()
     assert at_end[2100:].all()
+
+
+def test_small_windows_show_smeared_pixels_together() -> None:
+    rng = np.random.default_rng(5)
+    windows = []
+    for _ in range(20):
+        counts = np.full((WIDTH, WIDTH), 90.0)
+        counts[10:14, 10:14] = np.minimum(np.rint(rng.normal(255.0, 2.0, (4, 4))), 255.0)
+        windows.append((counts.ravel() * COUNT, WIDTH))
+    alone = [find_smear([window], COUNT)[0] for window in windows]
+    top, bottom = find_smear(windows, COUNT)
+    assert min(alone) == 0
+    assert 3 <= top <= 7
+    assert bottom == 0
+    levels, width = windows[int(np.argmin(alone))]
+    clip = find_censoring(levels, COUNT, width, (top, bottom))
+    assert np.count_nonzero(clip.at_high) >= 15
+    assert clip.ceiling == 1.0
 
 
 def test_levels_that_are_clipped_at_once_are_not_smeared() -> None:
