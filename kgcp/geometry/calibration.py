@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kgcp.errors import SettingError
+from kgcp.geometry._jit import compiled_if_often
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 
@@ -86,20 +87,37 @@ def distort_jacobian_by_calibration(camera: Camera, normalised: FloatArray) -> F
     (n, 2, 12) array
         Rows x, y [px], columns `CALIBRATION_PARAMETERS`.
     """
-    x, y = normalised[:, 0], normalised[:, 1]
-    r2 = x * x + y * y
-    above = 1.0 + r2 * (camera.k1 + r2 * (camera.k2 + r2 * camera.k3))
-    below = 1.0 + r2 * (camera.k4 + r2 * (camera.k5 + r2 * camera.k6))
-    slopes = np.zeros((len(x), 2, 12))
-    off = camera.distort(normalised) - [camera.cx, camera.cy]
-    slopes[:, 0, 0], slopes[:, 1, 1] = off[:, 0] / camera.fx, off[:, 1] / camera.fy
-    slopes[:, 0, 2] = slopes[:, 1, 3] = 1.0
-    radial = [camera.fx, camera.fy] * normalised * (r2 / below)[:, None]
-    share = (-above / below)[:, None]
-    for k_above, k_below in ((4, 9), (5, 10), (8, 11)):  # of r², r⁴, r⁶
-        slopes[:, :, k_above], slopes[:, :, k_below] = radial, share * radial
-        radial = radial * r2[:, None]
-    xy2 = 2.0 * x * y
-    slopes[:, 0, 6], slopes[:, 1, 6] = camera.fx * xy2, camera.fy * (r2 + 2.0 * y * y)
-    slopes[:, 0, 7], slopes[:, 1, 7] = camera.fx * (r2 + 2.0 * x * x), camera.fy * xy2
+    slopes = np.zeros((len(normalised), 2, len(CALIBRATION_PARAMETERS)))
+    lens = (camera.k1, camera.k2, camera.p1, camera.p2, camera.k3, camera.k4, camera.k5, camera.k6)
+    _fill_in_slopes(lens, (float(camera.fx), float(camera.fy)), normalised, slopes)
     return slopes
+
+
+@compiled_if_often
+def _fill_in_slopes(
+    lens: tuple[float, float, float, float, float, float, float, float],
+    focals_px: tuple[float, float],
+    normalised: FloatArray,
+    slopes: FloatArray,
+) -> None:
+    """Fill in the derivatives (n, 2, 12) by the calibration, in zeros."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = lens
+    fx, fy = focals_px
+    for i in range(len(normalised)):
+        x, y = normalised[i, 0], normalised[i, 1]
+        r2 = x * x + y * y
+        above = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        factor, xy2 = above / below, 2.0 * x * y
+        by_p1, by_p2 = r2 + 2.0 * y * y, r2 + 2.0 * x * x
+        slopes[i, 0, 0] = x * factor + p1 * xy2 + p2 * by_p2
+        slopes[i, 1, 1] = y * factor + p1 * by_p1 + p2 * xy2
+        slopes[i, 0, 2] = slopes[i, 1, 3] = 1.0
+        radial_x, radial_y = fx * x * (r2 / below), fy * y * (r2 / below)
+        for k_above, k_below in ((4, 9), (5, 10), (8, 11)):  # of r², r⁴, r⁶
+            slopes[i, 0, k_above], slopes[i, 1, k_above] = radial_x, radial_y
+            slopes[i, 0, k_below] = -factor * radial_x
+            slopes[i, 1, k_below] = -factor * radial_y
+            radial_x, radial_y = radial_x * r2, radial_y * r2
+        slopes[i, 0, 6], slopes[i, 1, 6] = fx * xy2, fy * by_p1
+        slopes[i, 0, 7], slopes[i, 1, 7] = fx * by_p2, fy * xy2

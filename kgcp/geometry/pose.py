@@ -164,6 +164,15 @@ def rotation_about(vector: FloatArray) -> FloatArray:
     )
 
 
+@compiled
+def rotations_about(vectors: FloatArray) -> FloatArray:
+    """Return the rotation matrices (n, 3, 3) of rotation vectors (n, 3) [rad]."""
+    rotations = np.empty((len(vectors), 3, 3))
+    for i in range(len(vectors)):
+        rotations[i] = rotation_about(vectors[i])
+    return rotations
+
+
 _rotation_about_few = interpreted(rotation_about)  # called once per frame: not worth compiling
 
 

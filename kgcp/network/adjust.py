@@ -20,6 +20,8 @@ from kgcp.network.equations import (
     prior_cost,
     reduce_poses,
     scales_of,
+    solution_of,
+    weighted_squares,
     whitened,
 )
 from kgcp.network.point_elimination import (
@@ -139,10 +141,8 @@ def _stepped(network: Network, estimate: Estimate, rows: NetworkRows, damping: f
 
 
 def _cost(network: Network, estimate: Estimate, weights: FloatArray) -> float:
-    residuals = network.observations.places - computed(network, estimate)
-    if not np.all(np.isfinite(residuals)):
-        return math.inf
-    return float(np.sum(whitened(network, residuals, weights) ** 2)) + prior_cost(network, estimate)
+    squares = weighted_squares(network, computed(network, estimate), weights)
+    return squares + prior_cost(network, estimate) if math.isfinite(squares) else math.inf
 
 
 def _solved(network: Network, estimate: Estimate, system: ReducedSystem) -> FloatArray:
@@ -150,11 +150,10 @@ def _solved(network: Network, estimate: Estimate, system: ReducedSystem) -> Floa
 
     Inner constraints keep the mean position, orientation and scale of the nominal points.
     """
+    if network.points.datum_defect == 0:
+        return solution_of(system.normal, system.right)
     scale = scales_of(system.normal)
     scaled = system.normal * np.outer(scale, scale)
-    if network.points.datum_defect == 0:
-        factor = linalg.cho_factor(scaled)
-        return np.asarray(scale * linalg.cho_solve(factor, scale * system.right))
     basis = inner_constraints(network, network.points.nominal) / scale.max()
     bordered = bordered_by(scaled, basis * scale[:, None])
     first = network.cameras.values.size

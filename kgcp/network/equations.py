@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
+from scipy.linalg import lapack
 
+from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.network.records import Estimate, ImageSlopes, Network, PointPrior, ScaleBar
 
@@ -76,16 +78,35 @@ class NetworkRows:
         The unknowns are those of `design`; the prior of the bends is included.
         """
         count, unknowns = len(self.starts) - 1, self.design.shape[1]
-        normals, rights = np.empty((count, unknowns, unknowns)), np.empty((count, unknowns))
-        bounds = (2 * self.starts).tolist()
-        for index, (first, last) in enumerate(pairwise(bounds)):
-            design = self.design[first:last]
-            normals[index] = design.T @ design
-            rights[index] = design.T @ self.residuals[first:last]
+        normals, rights = np.zeros((count, unknowns, unknowns)), np.zeros((count, unknowns))
+        _add_products(self.design, self.residuals, self.starts, normals, rights)
         pose = self.parameters
         normals[:, pose:, pose:] += self.bend_rows.T @ self.bend_rows
         rights[:, pose:] += self.bend_residuals @ self.bend_rows
         return normals, rights
+
+
+@compiled
+def _add_products(
+    design: FloatArray,
+    residuals: FloatArray,
+    starts: IndexArray,
+    normals: FloatArray,
+    rights: FloatArray,
+) -> None:
+    """Add the products of each photograph's rows to normal matrices (v, u, u) and right sides."""
+    unknowns = design.shape[1]
+    for view in range(len(normals)):
+        normal, right = normals[view], rights[view]
+        for row in range(2 * starts[view], 2 * starts[view + 1]):
+            for i in range(unknowns):
+                slope = design[row, i]
+                right[i] += slope * residuals[row]
+                for k in range(i + 1):
+                    normal[i, k] += slope * design[row, k]
+        for i in range(unknowns):
+            for k in range(i):
+                normal[k, i] = normal[i, k]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,19 +175,54 @@ def bent_points(network: Network, estimate: Estimate) -> FloatArray:
 def _camera_points(network: Network, estimate: Estimate) -> FloatArray:
     """Return the observed points (n, 3) in the frames of their cameras."""
     observed = network.observations
-    rotated = np.einsum(
-        "nij,nj->ni", estimate.rotations[observed.view], bent_points(network, estimate)
-    )
-    points: FloatArray = rotated + estimate.translations[observed.view]
-    is_flat = np.abs(points[:, 2]) < _MIN_DEPTH * np.linalg.norm(points, axis=1)
-    points[is_flat, 2] = _MIN_DEPTH
+    points = bent_points(network, estimate)
+    _move_to_cameras(estimate.rotations, estimate.translations, observed.view, points)
     return points
+
+
+@compiled
+def _move_to_cameras(
+    rotations: FloatArray, translations: FloatArray, view: IndexArray, points: FloatArray
+) -> None:
+    """Replace points (n, 3) in the field's frame by those in the frames of their cameras."""
+    for i in range(len(points)):
+        x, y, z = points[i]
+        rotation, translation = rotations[view[i]], translations[view[i]]
+        square = 0.0
+        for axis in range(3):
+            across = rotation[axis, 0] * x + rotation[axis, 1] * y + rotation[axis, 2] * z
+            points[i, axis] = across + translation[axis]
+            square += points[i, axis] * points[i, axis]
+        if abs(points[i, 2]) < _MIN_DEPTH * math.sqrt(square):
+            points[i, 2] = _MIN_DEPTH
 
 
 def whitened(network: Network, residuals: FloatArray, weights: FloatArray) -> FloatArray:
     """Return residuals (n, 2) in units of their standard deviations, times the root weights."""
     scaled = (network.observations.white @ residuals[:, :, None])[:, :, 0]
     return np.asarray(scaled * np.sqrt(weights)[:, None])
+
+
+def weighted_squares(network: Network, places: FloatArray, weights: FloatArray) -> float:
+    """Return the weighted sum of squares of the residuals at computed places (n, 2).
+
+    It is not finite if a place is not.
+    """
+    observed = network.observations
+    return float(_squares(observed.white, observed.places, places, weights))
+
+
+@compiled
+def _squares(
+    white: FloatArray, observed: FloatArray, places: FloatArray, weights: FloatArray
+) -> float:
+    total = 0.0
+    for i in range(len(places)):
+        x, y = observed[i, 0] - places[i, 0], observed[i, 1] - places[i, 1]
+        first = white[i, 0, 0] * x + white[i, 0, 1] * y
+        second = white[i, 1, 0] * x + white[i, 1, 1] * y
+        total += weights[i] * (first * first + second * second)
+    return total
 
 
 def network_rows(network: Network, estimate: Estimate, weights: FloatArray) -> NetworkRows:
@@ -180,30 +236,24 @@ def network_rows(network: Network, estimate: Estimate, weights: FloatArray) -> N
     starts = np.searchsorted(view_of, np.arange(len(network.view_camera) + 1))
     rays = _camera_points(network, estimate)[used]
     image = _images(network, estimate, network.view_camera[view_of], rays)
-    white = observed.white[used] * np.sqrt(weights[used])[:, None, None]
-    x, y, z = rays.T[:, :, None]
-    by_ray = (white @ image.by_ray) / z[:, :, None]
-    by_place = np.empty((len(used), 2, 3))
-    by_place[:, :, :2] = by_ray
-    by_place[:, :, 2] = -(by_ray[:, :, 0] * x + by_ray[:, :, 1] * y) / z
     bend_rows, bend_residuals = _bend_rows(network, estimate)
     parameters = len(network.model.names)
+    by_place = np.empty((len(used), 2, 3))
     design = np.empty((len(used), 2, parameters + bend_rows.shape[1]))
-    design[:, :, :parameters] = white @ image.by_parameter
-    by_pose = design[:, :, parameters:]
-    by_pose[:, :, :3] = by_place
-    # a rotation ω moves the point by ω × a, so that the row d changes by d · (ω × a) = ω · (a × d)
-    arm_x, arm_y, arm_z = (rays - estimate.translations[view_of]).T[:, :, None]
-    by_x, by_y, by_z = np.moveaxis(by_place, 2, 0)
-    by_pose[:, :, 3] = arm_y * by_z - arm_z * by_y
-    by_pose[:, :, 4] = arm_z * by_x - arm_x * by_z
-    by_pose[:, :, 5] = arm_x * by_y - arm_y * by_x
+    residuals = np.empty((len(used), 2))
+    _fill_in_rows(
+        used,
+        (observed.white, observed.places, np.sqrt(weights)),
+        (rays, estimate.translations, view_of),
+        (image.places, image.by_ray, image.by_parameter),
+        (by_place, design, residuals),
+    )
     by_point = None
     if network.bends is not None or not network.points.is_fixed:
         by_point = by_place @ estimate.rotations[view_of]
     if network.bends is not None and by_point is not None:
-        by_pose[:, :, 6:] = by_point[:, :, 2:] * network.bends.shapes[points][:, None, :]
-    residuals = white @ (observed.places[used] - image.places)[:, :, None]
+        shapes = network.bends.shapes[points][:, None, :]
+        design[:, :, parameters + 6 :] = by_point[:, :, 2:] * shapes
     return NetworkRows(
         used,
         starts,
@@ -214,6 +264,55 @@ def network_rows(network: Network, estimate: Estimate, weights: FloatArray) -> N
         bend_rows,
         bend_residuals,
     )
+
+
+@compiled
+def _fill_in_rows(
+    used: IndexArray,
+    observed: tuple[FloatArray, FloatArray, FloatArray],
+    seen: tuple[FloatArray, FloatArray, IndexArray],
+    image: tuple[FloatArray, FloatArray, FloatArray],
+    filled: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    """Fill in the whitened derivatives by places (n, 2, 3) and unknowns (n, 2, u), and residuals.
+
+    Parameters
+    ----------
+    used : (n,) array
+        The observations, of all those in `observed`: whitening, places and root weights.
+    seen : tuple
+        Their rays (n, 3), the translations (v, 3) and each one's photograph (n,).
+    image : tuple
+        The fields of `ImageSlopes`.
+    """
+    whites, places, root_weights = observed
+    rays, translations, view_of = seen
+    computed_places, by_ray, by_parameter = image
+    by_place, design, residuals = filled
+    parameters = by_parameter.shape[2]
+    for i in range(len(used)):
+        white, root = whites[used[i]], root_weights[used[i]]
+        x, y, z = rays[i]
+        translation = translations[view_of[i]]
+        arm_x, arm_y, arm_z = x - translation[0], y - translation[1], z - translation[2]
+        gap_x = places[used[i], 0] - computed_places[i, 0]
+        gap_y = places[used[i], 1] - computed_places[i, 1]
+        for row in range(2):
+            first, second = root * white[row, 0], root * white[row, 1]
+            by_x = (first * by_ray[i, 0, 0] + second * by_ray[i, 1, 0]) / z
+            by_y = (first * by_ray[i, 0, 1] + second * by_ray[i, 1, 1]) / z
+            by_z = -(by_x * x + by_y * y) / z
+            for k in range(parameters):
+                design[i, row, k] = first * by_parameter[i, 0, k] + second * by_parameter[i, 1, k]
+            by_place[i, row, 0], by_place[i, row, 1], by_place[i, row, 2] = by_x, by_y, by_z
+            of_pose = design[i, row, parameters:]
+            of_pose[0], of_pose[1], of_pose[2] = by_x, by_y, by_z
+            # a rotation ω moves the point by ω × a, so that the row d changes by
+            # d · (ω × a) = ω · (a × d)
+            of_pose[3] = arm_y * by_z - arm_z * by_y
+            of_pose[4] = arm_z * by_x - arm_x * by_z
+            of_pose[5] = arm_x * by_y - arm_y * by_x
+            residuals[i, row] = first * gap_x + second * gap_y
 
 
 def view_rows(network: Network, rows: NetworkRows) -> list[ViewRows]:
@@ -287,7 +386,7 @@ def reduce_poses(
     normals, rights = rows.normals()
     couplings = np.zeros((len(normals), size, rows.bend_rows.shape[1]))
     for camera in range(len(network.cameras.values)):
-        by_camera = network.view_camera == camera
+        by_camera = network.views_by(camera)
         own = slice(camera * parameters, (camera + 1) * parameters)
         normal[own, own] += normals[by_camera, :parameters, :parameters].sum(axis=0)
         right[own] += rights[by_camera, :parameters].sum(axis=0)
@@ -413,6 +512,21 @@ def scales_of(normal: FloatArray) -> FloatArray:
     if not np.all(diagonal > 0.0):
         raise np.linalg.LinAlgError("an unknown is not determined")
     return np.asarray(1.0 / np.sqrt(diagonal))
+
+
+def solution_of(normal: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the unknowns (u,) that solve normal equations (u, u) with a right side (u,).
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If an unknown is not determined.
+    """
+    scale = scales_of(normal)
+    _, solved, problem = lapack.dposv(normal * np.outer(scale, scale), scale * right)
+    if problem:
+        raise np.linalg.LinAlgError("the unknowns are not determined")
+    return np.asarray(scale * solved)
 
 
 def bordered_by(normal: FloatArray, basis: FloatArray) -> FloatArray:

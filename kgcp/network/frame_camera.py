@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -40,11 +42,7 @@ class FrameCameraModel:
 
     def camera(self, values: FloatArray) -> Camera:
         """Return the camera of some unknowns (p,)."""
-        fields = dict(zip(self.names, values.tolist(), strict=True))
-        if self.is_same_aspect:
-            ratio = self.template.fy / self.template.fx  # exactly 1 where they are the same
-            fields["fy"] = fields["fx"] * ratio
-        return replace(self.template, **fields)
+        return _camera(self, tuple(values.tolist()))
 
     def places(self, values: FloatArray, normalised: FloatArray) -> FloatArray:
         """Map normalised coordinates (n, 2) to pixels (n, 2); NaN if there is no such camera."""
@@ -66,9 +64,24 @@ class FrameCameraModel:
 
     def to_calibration(self) -> FloatArray:
         """Return the derivatives (12, p) of `CALIBRATION_PARAMETERS` by the unknowns."""
-        matrix = np.zeros((len(CALIBRATION_PARAMETERS), len(self.names)))
-        for column, name in enumerate(self.names):
-            matrix[CALIBRATION_PARAMETERS.index(name), column] = 1.0
-        if self.is_same_aspect:
-            matrix[1, 0] = self.template.fy / self.template.fx
-        return matrix
+        return _to_calibration(self)
+
+
+@lru_cache(maxsize=16)  # an adjustment asks several times for each camera that it tries
+def _camera(model: FrameCameraModel, values: tuple[float, ...]) -> Camera:
+    fields: dict[str, Any] = dict(zip(model.names, values, strict=True))
+    if model.is_same_aspect:
+        ratio = model.template.fy / model.template.fx  # exactly 1 where they are the same
+        fields["fy"] = fields["fx"] * ratio
+    return replace(model.template, **fields)
+
+
+@lru_cache(maxsize=16)
+def _to_calibration(model: FrameCameraModel) -> FloatArray:
+    matrix = np.zeros((len(CALIBRATION_PARAMETERS), len(model.names)))
+    for column, name in enumerate(model.names):
+        matrix[CALIBRATION_PARAMETERS.index(name), column] = 1.0
+    if model.is_same_aspect:
+        matrix[1, 0] = model.template.fy / model.template.fx
+    matrix.flags.writeable = False
+    return matrix

@@ -10,10 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.network.equations import NetworkRows, PointNormals, scales_of
+from kgcp.network.equations import NetworkRows, PointNormals, solution_of
 from kgcp.network.records import Estimate, Network
 
 
@@ -57,7 +56,7 @@ def reduce_points(
     poses = normal[cameras:, cameras:].reshape(views, unknowns, views, unknowns)
     poses[index, :, index, :] = normals[:, parameters:, parameters:]
     for camera in range(len(network.cameras.values)):
-        by_camera = network.view_camera == camera
+        by_camera = network.views_by(camera)
         own = slice(camera * parameters, (camera + 1) * parameters)
         normal[own, own] += normals[by_camera, :parameters, :parameters].sum(axis=0)
         right[own] += rights[by_camera, :parameters].sum(axis=0)
@@ -89,9 +88,7 @@ def reduce_points(
 
 def moved_by_points(network: Network, estimate: Estimate, system: PointReducedSystem) -> Estimate:
     """Return the estimate after the step that solves the equations."""
-    scale = scales_of(system.normal)
-    factor = linalg.cho_factor(system.normal * np.outer(scale, scale))
-    step = scale * linalg.cho_solve(factor, scale * system.right)
+    step = solution_of(system.normal, system.right)
     point_right = system.point_right - np.einsum("xmi,x->mi", system.coupling, step)
     points = estimate.points + np.einsum("mij,mj->mi", system.point_inverses, point_right)
     cameras = network.cameras.values.size

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
-from kgcp.geometry.pose import rotation_about
+from kgcp.geometry.pose import rotations_about
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,6 +135,10 @@ class Network:
         """Number of bends per photograph."""
         return 0 if self.bends is None else self.bends.shapes.shape[1]
 
+    def views_by(self, camera: int) -> BoolArray | slice:
+        """Return the index of the photographs that a camera took; all of them: a slice."""
+        return slice(None) if len(self.cameras.values) == 1 else self.view_camera == camera
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
@@ -171,10 +175,9 @@ class Estimate:
         points : (m, 3) array
             The new coordinates, not a step.
         """
-        rotations = np.array([rotation_about(vector) for vector in poses[:, 3:6]])
         return Estimate(
             self.cameras + cameras.reshape(self.cameras.shape),
-            rotations @ self.rotations,
+            rotations_about(poses[:, 3:6]) @ self.rotations,
             self.translations + poses[:, :3],
             points,
             self.bends + poses[:, 6:] if self.bends.size else self.bends,
