@@ -15,8 +15,14 @@ from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
-from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.camera import Camera
+from kgcp.network.ground.point_equations import (
+    add_products,
+    fill_in_covariances,
+    fill_in_derivatives,
+    fill_in_residuals,
+    fill_in_squares,
+)
 from kgcp.network.ground.point_images import CameraPose, PointImages
 
 MAX_STEPS = 40
@@ -27,7 +33,6 @@ _ROUNDING = 1e-9  # expected decrease of χ² below which no step is tried
 # The curve of likely poses is followed to this many standard deviations on either side. At its
 # ends, χ² must have risen by at least this share of the rise that the covariance predicts.
 _CURVE_END_SD, _MIN_RISE = 3.0, 0.5
-_NO_DISTANCE_SD = 1e6  # standard deviation of the logarithm of a distance that is not measured
 _HALF_WEIGHT_CHI2 = 9.0  # χ² of a point that has weight 1/2 in the common errors
 _COMMON_ROUNDS = 5  # rounds of reweighting for the common errors
 # Lower limit of a rotation rate's standard deviation. A file may state 0, which has no inverse.
@@ -49,8 +54,20 @@ class _Linearised:
 
 def _linearised(camera: Camera, images: PointImages, pose: CameraPose) -> _Linearised:
     """Return observations near a pose; points behind the camera have no residual."""
-    residuals = _residuals(camera, images, pose)
-    design, by_point = _design(camera, images, pose)
+    points = pose.in_camera(images.positions_m)
+    normalised = pose.focal_scale * points[:, :2] / points[:, 2:]
+    residuals = _residuals_at(camera, images, pose, points, normalised)
+    design, by_point = np.empty((len(images), 3, 7)), np.empty((len(images), 3, 3))
+    fill_in_derivatives(
+        points,
+        normalised,
+        camera.distort_jacobian(normalised),
+        images.positions_m - pose.centre_m,
+        np.ascontiguousarray(pose.world_from_camera),  # compiled once
+        pose.focal_scale,
+        design,
+        by_point,
+    )
     parts, sds = [], []
     if images.sd_scale:
         of_distance = np.zeros((len(images), 3, 1))
@@ -73,62 +90,48 @@ def _linearised(camera: Camera, images: PointImages, pose: CameraPose) -> _Linea
     return _Linearised(residuals, design, by_point, common, np.array(sds) ** -2.0)
 
 
-def _projected(
-    camera: Camera, pose: CameraPose, points_m: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return pixels (n, 2), NaN behind the camera, and points in the camera frame (n, 3)."""
-    points = pose.in_camera(points_m)
-    depth = np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
-    return camera.distort(pose.focal_scale * points[:, :2] / depth[:, None]), points
-
-
 def _residuals(camera: Camera, images: PointImages, pose: CameraPose) -> FloatArray:
     """Return observed minus computed places [px] and logarithms of distances (n, 3)."""
-    pixels, points = _projected(camera, pose, images.positions_m)
-    logs = np.log(images.distances_m * pose.focal_scale / np.linalg.norm(points, axis=1))
-    return np.column_stack((images.pixels - pixels, logs))
+    points = pose.in_camera(images.positions_m)
+    normalised = pose.focal_scale * points[:, :2] / points[:, 2:]
+    return _residuals_at(camera, images, pose, points, normalised)
 
 
-def _design(camera: Camera, images: PointImages, pose: CameraPose) -> tuple[FloatArray, FloatArray]:
-    """Return derivatives (n, 3, 7) by the pose's step and (n, 3, 3) by the points' positions.
+def _residuals_at(
+    camera: Camera,
+    images: PointImages,
+    pose: CameraPose,
+    points: FloatArray,
+    normalised: FloatArray,
+) -> FloatArray:
+    """Return `_residuals` for points in the camera frame (n, 3) and their images (n, 2).
 
     A measured distance is proportional to the focal length; it was computed with the camera's own.
     """
-    points = pose.in_camera(images.positions_m)
-    normalised = pose.focal_scale * points[:, :2] / points[:, 2:]
-    lens = camera.distort_jacobian(normalised)
-    to_plane = np.zeros((len(images), 2, 3))
-    to_plane[:, 0, 0] = to_plane[:, 1, 1] = pose.focal_scale
-    to_plane[:, :, 2] = -normalised
-    by_camera_point = np.empty((len(images), 3, 3))
-    by_camera_point[:, :2] = lens @ (to_plane / points[:, 2, None, None])
-    by_camera_point[:, 2] = points / np.sum(points**2, axis=1)[:, None]
-    by_point = by_camera_point @ pose.world_from_camera.T
-    by_focal = np.zeros((len(images), 3, 1))
-    by_focal[:, :2, 0] = np.einsum("nij,nj->ni", lens, normalised)
-    by_focal[:, 2, 0] = -1.0
-    # with R' = exp(ω) R a point moves by (X − C) × ω in the world's axes
-    by_turn = by_point @ cross_matrix(images.positions_m - pose.centre_m)
-    return np.concatenate((-by_point, by_turn, by_focal), axis=2), by_point
+    residuals = np.empty((len(images), 3))
+    computed_px = camera.distort(normalised)
+    fill_in_residuals(
+        points, pose.focal_scale, computed_px, images.pixels, images.distances_m, residuals
+    )
+    return residuals
 
 
 def _covariances(images: PointImages, by_point: FloatArray) -> FloatArray:
     """Return the covariances (n, 3, 3) of the observations, including those of the positions."""
-    cov = by_point @ images.position_cov @ np.swapaxes(by_point, 1, 2)
-    cov[:, :2, :2] += images.pixel_cov
-    known = images.has_distance
-    cov[~known, 2, :] = cov[~known, :, 2] = 0.0
-    cov[known, 2, 2] += (images.sd_distances_m[known] / images.distances_m[known]) ** 2
-    cov[~known, 2, 2] = _NO_DISTANCE_SD**2
-    return np.asarray(cov)
+    cov = np.empty_like(by_point)
+    sds = images.sd_distances_m
+    fill_in_covariances(
+        by_point, images.position_cov, images.pixel_cov, images.distances_m, sds, cov
+    )
+    return cov
 
 
 def _chi2(residuals: FloatArray, cov: FloatArray) -> FloatArray:
     """Return the χ² (n,) of points; infinite behind the camera."""
-    behind = ~np.isfinite(residuals[:, 0])
-    measured = np.nan_to_num(residuals)
-    squares = np.einsum("nm,nm->n", measured, np.linalg.solve(cov, measured[..., None])[..., 0])
-    return np.asarray(np.where(behind, np.inf, squares))
+    squares = np.empty(len(residuals))
+    if not fill_in_squares(residuals, cov, squares):
+        raise np.linalg.LinAlgError("a covariance is singular")
+    return squares
 
 
 def adjusted_pose(
@@ -249,14 +252,12 @@ def _normal_equations(
     if not _is_ahead(images, pose).all():
         return np.eye(unknowns), np.zeros(unknowns), math.inf
     near = _linearised(camera, images, pose)
-    measured = np.nan_to_num(near.residuals)[..., None]
-    rows = np.concatenate((near.design[:, :, :unknowns], measured, near.common), axis=2)
     cov = _covariances(images, near.by_point)
-    try:
-        weighted = weights[:, None, None] * np.linalg.solve(cov, rows)
-    except np.linalg.LinAlgError:  # the step put a point into the projection centre
+    square = np.zeros((unknowns + 1 + near.common.shape[2],) * 2)
+    observed = near.design, near.residuals, near.common
+    if not add_products(unknowns, *observed, cov, weights, square):
+        # the step put a point into the projection centre
         return np.eye(unknowns), np.zeros(unknowns), math.inf
-    square = np.einsum("nmp,nmq->pq", rows, weighted)
     square = _without_common(square, near.precisions)
     normal, right = square[:unknowns, :unknowns], square[:unknowns, unknowns]
     cost = float(square[unknowns, unknowns])
@@ -270,6 +271,8 @@ def _normal_equations(
 
 def _without_common(square: FloatArray, precisions: FloatArray) -> FloatArray:
     """Eliminate the last k unknowns from a matrix of products of columns (Schur complement)."""
+    if not len(precisions):
+        return square
     kept = len(square) - len(precisions)
     normal = square[kept:, kept:] + np.diag(precisions)
     return np.asarray(
