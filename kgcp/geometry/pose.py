@@ -72,7 +72,7 @@ class Pose:
 
         Both are in the camera frame; the rotation is applied from the left.
         """
-        turn = _rotation_about_few(step[3:6])
+        turn = rotation_about_once(step[3:6])
         return Pose(turn @ self.rotation, self.translation_m + step[:3])
 
     def mirrored(self) -> Pose:
@@ -173,7 +173,8 @@ def rotations_about(vectors: FloatArray) -> FloatArray:
     return rotations
 
 
-_rotation_about_few = interpreted(rotation_about)  # called once per frame: not worth compiling
+rotation_about_once = interpreted(rotation_about)
+"""The same for one call per frame or flight, which is not worth loading compiled code."""
 
 
 def image_heading_deg(camera: Camera, pose: Pose) -> float:

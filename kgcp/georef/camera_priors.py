@@ -27,7 +27,7 @@ from kgcp.geometry.attitude import (
     cross_matrix,
     opk_from_rotation,
 )
-from kgcp.geometry.pose import rotation_about
+from kgcp.geometry.pose import rotation_about_once
 from kgcp.georef.gcp import Gcp
 from kgcp.georef.interpolation_error import interpolation_errors
 from kgcp.georef.local_frame import LocalFrame
@@ -94,7 +94,7 @@ def opk_covs(priors: Sequence[CameraPrior]) -> list[FloatArray | None]:
 
 def body_from_plate(mount_deg: float) -> FloatArray:
     """Return the plate's axes (3, 3) in body axes, as columns, turned from the default mount."""
-    turn = rotation_about(np.array([0.0, 0.0, math.radians(mount_deg)]))
+    turn = rotation_about_once(np.array([0.0, 0.0, math.radians(mount_deg)]))
     return np.asarray(BODY_FROM_LEVEL_PLATE @ turn)
 
 
