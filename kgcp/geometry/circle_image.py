@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.calibration import distort_jacobian_by_calibration
@@ -133,27 +134,65 @@ def circle_images(camera: Camera, circles: Circles3D) -> CircleImages:
 
 def circle_derivatives(camera: Camera, circles: Circles3D) -> CircleDerivatives:
     """Return the moments of `circle_images` and their analytic derivatives."""
-    arms = circles.arms_m()
-    points = circles.centres_m[:, None] + arms
     normalised = _outlines(circles)
     outlines = _distorted(camera, normalised)
     area, moments = _moments(outlines)
     weights = _boundary_weights(outlines, area, moments)
-    x, y = normalised[..., 0], normalised[..., 1]
-    projection = np.zeros((*x.shape, 2, 3))
-    projection[..., 0, 0] = projection[..., 1, 1] = 1.0
-    projection[..., 0, 2], projection[..., 1, 2] = -x, -y
-    projection /= points[..., 2, None, None]
-    by_point = camera.distort_jacobian(normalised) @ projection
-    # a rotation vector ω moves an arm a by ω × a; with a gradient g, g · (ω × a) = ω · (a × g)
-    by_rotation = by_point @ cross_matrix(-arms)
-    by_radius = by_point @ (arms / circles.radii_m[:, None, None])[..., None]
-    return CircleDerivatives(
-        moments,
-        _along_outlines(weights, by_point),
-        _along_outlines(weights, by_rotation),
-        _along_outlines(weights, by_radius)[..., 0],
+    count = len(moments)
+    by_centre, by_rotation = np.empty((count, 5, 3)), np.empty((count, 5, 3))
+    by_radius = np.empty((count, 5))
+    _fill_in_derivatives(
+        np.ascontiguousarray(weights),
+        camera.distort_jacobian(normalised),
+        normalised,
+        np.ascontiguousarray(circles.arms_m()),
+        np.ascontiguousarray(circles.centres_m),
+        (by_centre, by_rotation, by_radius),
     )
+    return CircleDerivatives(moments, by_centre, by_rotation, by_radius / circles.radii_m[:, None])
+
+
+@compiled
+def _fill_in_derivatives(
+    weights: FloatArray,
+    lens: FloatArray,
+    normalised: FloatArray,
+    arms: FloatArray,
+    centres: FloatArray,
+    derivatives: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    """Fill in the derivatives of moments by centres, rotations and the radii's logarithms.
+
+    Parameters
+    ----------
+    weights : (n, k, 5, 2) array
+        Those of `_boundary_weights`.
+    lens : (n, k, 2, 2) array
+        Derivatives of the outlines' pixels by the normalised coordinates (n, k, 2).
+    arms : (n, k, 3) array
+        From the centres (n, 3) to the outlines' points.
+    """
+    by_centre, by_rotation, by_radius = derivatives
+    by_centre[:], by_rotation[:], by_radius[:] = 0.0, 0.0, 0.0
+    for i in range(len(arms)):
+        for k in range(arms.shape[1]):
+            arm_x, arm_y, arm_z = arms[i, k]
+            depth = centres[i, 2] + arm_z
+            x, y = normalised[i, k]
+            for m in range(5):
+                first, second = weights[i, k, m]
+                by_x = (first * lens[i, k, 0, 0] + second * lens[i, k, 1, 0]) / depth
+                by_y = (first * lens[i, k, 0, 1] + second * lens[i, k, 1, 1]) / depth
+                by_z = -(by_x * x + by_y * y)
+                by_centre[i, m, 0] += by_x
+                by_centre[i, m, 1] += by_y
+                by_centre[i, m, 2] += by_z
+                # a rotation vector ω moves an arm a by ω × a; with a gradient g,
+                # g · (ω × a) = ω · (a × g)
+                by_rotation[i, m, 0] += arm_y * by_z - arm_z * by_y
+                by_rotation[i, m, 1] += arm_z * by_x - arm_x * by_z
+                by_rotation[i, m, 2] += arm_x * by_y - arm_y * by_x
+                by_radius[i, m] += by_x * arm_x + by_y * arm_y + by_z * arm_z
 
 
 def moments_jacobian_by_calibration(camera: Camera, circles: Circles3D) -> FloatArray:
@@ -194,9 +233,36 @@ def eccentricity(camera: Camera, circles: Circles3D) -> Eccentricity:
 
 def _outlines(circles: Circles3D) -> FloatArray:
     """Return normalised outlines (n, k, 2); NaN for circles not entirely in front of the camera."""
-    points = circles.centres_m[:, None] + circles.arms_m()
-    depth = np.where(np.all(points[..., 2] > 0.0, axis=1)[:, None], points[..., 2], np.nan)
-    return np.asarray(points[..., :2] / depth[..., None])
+    outlines = np.empty((len(circles.centres_m), OUTLINE_POINTS, 2))
+    _fill_in_outlines(
+        np.ascontiguousarray(circles.centres_m),
+        np.ascontiguousarray(circles.axes),
+        np.ascontiguousarray(circles.radii_m),
+        _UNIT_CIRCLE,
+        outlines,
+    )
+    return outlines
+
+
+@compiled
+def _fill_in_outlines(
+    centres: FloatArray,
+    axes: FloatArray,
+    radii: FloatArray,
+    circle: FloatArray,
+    outlines: FloatArray,
+) -> None:
+    for i in range(len(centres)):
+        is_ahead = True
+        for k in range(len(circle)):
+            u, v = circle[k]
+            x = centres[i, 0] + radii[i] * (axes[i, 0, 0] * u + axes[i, 0, 1] * v)
+            y = centres[i, 1] + radii[i] * (axes[i, 1, 0] * u + axes[i, 1, 1] * v)
+            z = centres[i, 2] + radii[i] * (axes[i, 2, 0] * u + axes[i, 2, 1] * v)
+            outlines[i, k, 0], outlines[i, k, 1] = x / z, y / z
+            is_ahead &= z > 0.0
+        if not is_ahead:
+            outlines[i] = np.nan
 
 
 def _distorted(camera: Camera, normalised: FloatArray) -> FloatArray:
@@ -209,20 +275,42 @@ def _moments(outlines: FloatArray) -> tuple[FloatArray, FloatArray]:
     The integrals are taken about the mean of the points: differences of large numbers would lose
     digits.
     """
-    middle = outlines.mean(axis=1)
-    x, y = np.moveaxis(outlines - middle[:, None], -1, 0)
-    dx, dy = x @ _DIFFERENTIATION.T * _STEP_RAD, y @ _DIFFERENTIATION.T * _STEP_RAD
-    area = 0.5 * np.sum(x * dy - y * dx, axis=1)
-    area[np.abs(area) < _MIN_AREA] = np.nan
-    signed_area = area  # all integrals have the sign of the outline's sense, which cancels
-    x2_dy, y2_dx = x * x * dy, y * y * dx
-    mean_x = 0.5 * np.sum(x2_dy, axis=1) / signed_area
-    mean_y = -0.5 * np.sum(y2_dx, axis=1) / signed_area
-    xx = np.sum(x * x2_dy, axis=1) / (3.0 * signed_area) - mean_x**2
-    yy = -np.sum(y * y2_dx, axis=1) / (3.0 * signed_area) - mean_y**2
-    xy = 0.5 * np.sum(y * x2_dy, axis=1) / signed_area - mean_x * mean_y
-    moments = np.column_stack((middle[:, 0] + mean_x, middle[:, 1] + mean_y, xx, xy, yy))
-    return np.abs(area), moments
+    area, moments = np.empty(len(outlines)), np.empty((len(outlines), 5))
+    _fill_in_moments(np.ascontiguousarray(outlines), _DIFFERENTIATION * _STEP_RAD, area, moments)
+    return area, moments
+
+
+@compiled
+def _fill_in_moments(
+    outlines: FloatArray, differentiation: FloatArray, area: FloatArray, moments: FloatArray
+) -> None:
+    points = outlines.shape[1]
+    x, y, dx, dy = np.empty(points), np.empty(points), np.empty(points), np.empty(points)
+    for i in range(len(outlines)):
+        middle_x, middle_y = np.mean(outlines[i, :, 0]), np.mean(outlines[i, :, 1])
+        dx[:], dy[:] = 0.0, 0.0
+        for k in range(points):
+            x[k], y[k] = outlines[i, k, 0] - middle_x, outlines[i, k, 1] - middle_y
+            for j in range(points):  # the matrix is antisymmetric
+                dx[j] -= differentiation[k, j] * x[k]
+                dy[j] -= differentiation[k, j] * y[k]
+        doubled = mean_x = mean_y = xx = xy = yy = 0.0
+        for k in range(points):
+            x2_dy, y2_dx = x[k] * x[k] * dy[k], y[k] * y[k] * dx[k]
+            doubled += x[k] * dy[k] - y[k] * dx[k]
+            mean_x += x2_dy
+            mean_y -= y2_dx
+            xx += x[k] * x2_dy
+            xy += y[k] * x2_dy
+            yy -= y[k] * y2_dx
+        # all integrals have the sign of the outline's sense, which cancels
+        signed_area = 0.5 * doubled if abs(0.5 * doubled) >= _MIN_AREA else np.nan
+        mean_x, mean_y = 0.5 * mean_x / signed_area, 0.5 * mean_y / signed_area
+        area[i] = abs(signed_area)
+        moments[i, 0], moments[i, 1] = middle_x + mean_x, middle_y + mean_y
+        moments[i, 2] = xx / (3.0 * signed_area) - mean_x * mean_x
+        moments[i, 3] = 0.5 * xy / signed_area - mean_x * mean_y
+        moments[i, 4] = yy / (3.0 * signed_area) - mean_y * mean_y
 
 
 def _boundary_weights(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import fdtri
 
+from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle_image import circle_derivatives
@@ -95,15 +97,30 @@ def best_split(
     return Split(first, off_m, gain / by_chance)
 
 
+@compiled
 def _place(residuals: FloatArray, design: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the shift (3,) with the least sum of the residuals' norms, and these norms (n,)."""
-    weights = np.ones(len(residuals))
+    count = len(residuals)
+    weights, norms, shift = np.ones(count), np.empty(count), np.empty(3)
     for _ in range(_ROUNDS):
-        normal = np.einsum("n,nij,nik->jk", weights, design, design)
-        right = np.einsum("n,nij,ni->j", weights, design, residuals)
-        shift = np.linalg.lstsq(normal, right, rcond=1e-14)[0]
-        norms = np.linalg.norm(residuals - design @ shift, axis=1)
-        weights = 1.0 / np.maximum(norms, 0.1 * float(np.median(norms)) + 1e-9)
+        normal, right = np.zeros((3, 3)), np.zeros(3)
+        for i in range(count):
+            for axis in range(2):
+                for j in range(3):
+                    slope = weights[i] * design[i, axis, j]
+                    right[j] += slope * residuals[i, axis]
+                    for k in range(3):
+                        normal[j, k] += slope * design[i, axis, k]
+        shift[:] = np.linalg.lstsq(normal, right, 1e-14)[0]
+        for i in range(count):
+            square = 0.0
+            for axis in range(2):
+                off = residuals[i, axis]
+                for j in range(3):
+                    off -= design[i, axis, j] * shift[j]
+                square += off * off
+            norms[i] = math.sqrt(square)
+        weights[:] = 1.0 / np.maximum(norms, 0.1 * float(np.median(norms)) + 1e-9)
     return shift, norms
 
 
