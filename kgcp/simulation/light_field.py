@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, minimum_filter
 
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.simulation.light_settings import Dirt, Glare, Shadow
 from kgcp.simulation.plane_raster import PlaneRaster
 
@@ -172,10 +172,18 @@ class PlateLight:
         """
         x_m, y_m = patch.x_m, patch.y_m
         share = self._sharp_share(x_m, y_m)
-        down, across = _steps(share)
+        if np.ptp(share) > 0.0:
+            self._integrate(share, x_m, y_m)
+        if self.cloud is not None:
+            share *= self.cloud.reflectance(x_m, y_m)
+        return share
+
+    def _integrate(self, share: FloatArray, x_m: FloatArray, y_m: FloatArray) -> None:
+        """Replace shares at the sub-pixels' centres by means, in place, where they vary."""
+        down, across = np.gradient(share)
         varies = np.nonzero((down != 0.0) | (across != 0.0))
         (x_down, x_across), (y_down, y_across) = (
-            [0.5 * step[varies] for step in _steps(places)] for places in (x_m, y_m)
+            [0.5 * step for step in _steps_at(places, *varies)] for places in (x_m, y_m)
         )
         x_m, y_m = x_m[varies], y_m[varies]
         mean = np.zeros_like(x_m)
@@ -184,9 +192,6 @@ class PlateLight:
                 x_at, y_at = x_m + a * x_across + b * x_down, y_m + a * y_across + b * y_down
                 mean += weight_a * weight_b * self._sharp_share(x_at, y_at)
         share[varies] = mean
-        if self.cloud is not None:
-            share *= self.cloud.reflectance(patch.x_m, patch.y_m)
-        return share
 
     def _sharp_share(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
         """Return the share of light at places on the plate, by shade and stains."""
@@ -207,24 +212,33 @@ def _share_of_edges(painted: FloatArray, light: FloatArray) -> FloatArray:
     square is about S (1 − S) n / 2: exact if the edge is parallel to a side, 6 % too large at 45°.
     The levels on both sides are taken from the neighbouring sub-pixels.
     """
-    light_down, light_across = _steps(light)
     excess = np.zeros_like(painted)
-    if not (light_down.any() or light_across.any()):
+    if np.ptp(light) == 0.0:
         return excess
     low, high = minimum_filter(painted, 3), maximum_filter(painted, 3)
-    down, across = _steps(painted)
+    edge = np.nonzero(high > low)
+    down, across = _steps_at(painted, *edge)
     slope = np.hypot(down, across)
-    edge = np.nonzero((slope > 0.0) & (high > low))
+    is_sloped = slope > 0.0
+    edge = edge[0][is_sloped], edge[1][is_sloped]
+    down, across, slope = down[is_sloped], across[is_sloped], slope[is_sloped]
+    light_down, light_across = _steps_at(light, *edge)
     moment = (painted[edge] - low[edge]) * (high[edge] - painted[edge])
-    moment /= 2.0 * (high[edge] - low[edge]) * slope[edge]
-    excess[edge] = moment * (down[edge] * light_down[edge] + across[edge] * light_across[edge])
+    moment /= 2.0 * (high[edge] - low[edge]) * slope
+    excess[edge] = moment * (down * light_down + across * light_across)
     return excess
 
 
-def _steps(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the change per sub-pixel, downwards and rightwards."""
-    down, across = np.gradient(values)
-    return np.asarray(down), np.asarray(across)
+def _steps_at(
+    values: FloatArray, rows: IndexArray, columns: IndexArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the change per sub-pixel (n,), downwards and rightwards, as by `numpy.gradient`."""
+    last_row, last_column = np.array(values.shape) - 1
+    above, below = np.maximum(rows - 1, 0), np.minimum(rows + 1, last_row)
+    left, right = np.maximum(columns - 1, 0), np.minimum(columns + 1, last_column)
+    down = (values[below, columns] - values[above, columns]) / (below - above)
+    across = (values[rows, right] - values[rows, left]) / (right - left)
+    return down, across
 
 
 def _cast_shades(shadow: Shadow, rng: np.random.Generator) -> tuple[Shade, ...]:
