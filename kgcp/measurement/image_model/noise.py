@@ -58,6 +58,9 @@ _MIN_SMEAR_EXCESS, _SMEAR_SIGMAS = 1.0, 2.5
 # look smeared. In six of the photographs `ros10`, 239 of 593 discs looked smeared because of their
 # edges alone; with this test, the scatter of their centres fell from 0.103 px to 0.085 px.
 _MIN_SMEARED_AWAY = 0.2
+# Windows with fewer pixels within six grey values of the end do not tell smeared ones. Larger ones
+# of `ros10` do: the scatter of its centres would be 0.080 instead of 0.076 px.
+_TELLING_PIXELS = 100
 # Largest shares of clipped pixels at which both levels are well seen: of all, and of the bright
 # ones, since a small bright disc fills little of its window
 _MUCH_CLIPPED, _MUCH_OF_BRIGHT = 0.05, 0.1
@@ -135,7 +138,8 @@ def find_censoring(
     width : int
         Pixels of a row.
     smear : (int, int)
-        By `find_smear`, of the whole photograph: it counts if it is more than that of the window.
+        By `find_smear`, of the whole photograph. It counts if the window has too few pixels near
+        the end of the range to tell.
     """
     high, low = 1.0 - 0.5 * levels_per_count, 0.5 * levels_per_count
     top, brightest = float(levels.max()), 1.0
@@ -144,8 +148,15 @@ def find_censoring(
         at_top = float(np.mean(levels == top))
         if at_top > _PILED_UP > float(np.mean(levels > _JUST_BELOW * top)) - at_top:
             high, brightest = top - 0.5 * levels_per_count, top
-    own = find_smear([(levels, width)], levels_per_count)
-    top_smear, bottom_smear = map(max, own, smear)
+    top_smear, bottom_smear = (
+        max(own, of_all) if near < _TELLING_PIXELS else own
+        for own, of_all, near in zip(
+            find_smear([(levels, width)], levels_per_count),
+            smear,
+            _pixels_near_ends(levels, levels_per_count)[:, : _MAX_SMEAR_COUNTS + 1].sum(axis=1),
+            strict=True,
+        )
+    )
     high, low = high - top_smear * levels_per_count, low + bottom_smear * levels_per_count
     ceiling, floor = 1.0 if top_smear else math.inf, 0.0 if bottom_smear else -math.inf
     return Censoring(high, low, levels >= high, levels <= low, ceiling, floor, brightest)
