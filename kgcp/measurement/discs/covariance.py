@@ -20,7 +20,7 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.discs.affine_model import Geometry, mean_radius_px
 from kgcp.measurement.discs.compressed_fit import CompressedFit
 from kgcp.measurement.discs.disc_levels import GEOMETRY_COUNT
-from kgcp.measurement.discs.fit_disc import DiscFit
+from kgcp.measurement.discs.fit_disc import DiscFit, DiscSample
 from kgcp.measurement.discs.pixel_choice import outward_px
 from kgcp.measurement.image_model.noise import median_at_edges
 from kgcp.measurement.image_model.photometry import Tone
@@ -58,6 +58,10 @@ _BY_UNKNOWN_CURVE, _BY_UNKNOWN_CURVE_OF_BURNT = 0.15, 0.3
 # would take that up, but displace centres where the light falls off: by 0.005 px at R 150 px, 1.9
 # deviations.
 _BY_COMPRESSION, _BY_COMPRESSION_OF_BURNT, _BY_BOTH_OF_BURNT = 0.08, 0.3, 0.7
+# A single disc may be too small to show smeared pixels (`find_smear`), and its surroundings too
+# even to show JPEG's blocks. Compression counts as found if more pixels than this share of the
+# clipped ones are within six grey values below them: without compression, 1 to 5 % are.
+_BELOW_CLIPPED, _BELOW_COUNTS = 0.15, 6.0
 # Burnt discs whose radius is less than this many times the blur do not tell size from brightness:
 # at R 3 px, out of focus by 2 px, edges are displaced by 0.35 px (`defocused_clipped`).
 _FEW_BLURS, _BY_BLUR_OF_BURNT = 3.0, 0.3
@@ -282,13 +286,13 @@ def _camera_displacement_px(fit: DiscFit) -> float:
     Compression changes both sides of an edge alike, and does not displace it, unless a curve or
     burnt white makes the sides differ. On burnt ground, smeared clipped values show compression.
     """
-    free, limits = fit.free, fit.sample.censoring
+    free = fit.free
     by_curve = _BY_UNKNOWN_CURVE if free.is_curve_unknown else 0.0
     by_compression = by_blur = 0.0
     blur_px = fit.state.blur.mean_sd_px
     if fit.sample.is_burnt:
         by_curve = _BY_UNKNOWN_CURVE_OF_BURNT if free.is_curve_unknown else 0.0
-        if free.is_compressed or math.isfinite(limits.ceiling) or math.isfinite(limits.floor):
+        if free.is_compressed or _looks_smeared(fit.sample):
             by_compression = _BY_BOTH_OF_BURNT if by_curve else _BY_COMPRESSION_OF_BURNT
         if mean_radius_px(fit.state.geometry) < _FEW_BLURS * blur_px:
             by_blur = _BY_BLUR_OF_BURNT
@@ -333,6 +337,15 @@ def levels_changed(fit: DiscFit, changes: FloatArray) -> FloatArray:
     changed = [replace(share, value=share.value + change) for change in changes]
     levels = [fit.sample.level_model.linearised(each, state.vector)[0] for each in changed]
     return np.array(levels) - fit.levels
+
+
+def _looks_smeared(sample: DiscSample) -> bool:
+    """Tell whether compression may have smeared clipped pixels, even if they are few."""
+    limits, step = sample.censoring, sample.window.levels_per_count
+    if math.isfinite(limits.ceiling) or math.isfinite(limits.floor):
+        return True
+    below = (sample.levels < limits.high) & (sample.levels > limits.high - _BELOW_COUNTS * step)
+    return bool(np.count_nonzero(below) > _BELOW_CLIPPED * np.count_nonzero(limits.at_high) > 0)
 
 
 def _edges_tell_displacement(fit: DiscFit) -> bool:
