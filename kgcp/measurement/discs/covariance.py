@@ -140,7 +140,7 @@ def scatter_of(adjusted: DiscFit | CompressedFit) -> DiscScatter:
         by_point_spread = np.zeros(GEOMETRY_COUNT)
     else:
         common_px = common_displacement_px(fit)
-        by_point_spread = _displacement_by_point_spread(fit, own)
+        by_point_spread = _displacement_by_point_spread(fit)
     # an edge that is displaced everywhere alike changes M by a multiple of the identity
     grown = np.array((0.0, 0.0, 1.0, 0.0, 1.0)) * common_px
     common = np.outer(grown, grown) + np.diag([_FLOOR_PX**2] * GEOMETRY_COUNT)
@@ -301,21 +301,18 @@ def _camera_displacement_px(fit: DiscFit) -> float:
     return math.hypot(math.hypot(by_curve, by_compression, by_blur) * blur_px, free.curve_spread_px)
 
 
-def _displacement_by_point_spread(fit: DiscFit, own: FloatArray) -> FloatArray:
+def _displacement_by_point_spread(fit: DiscFit) -> FloatArray:
     """Return one standard deviation of the ellipse (5,) by the shape of the point spread [px].
 
-    An edge that is seen as a whole hardly depends on it. Of a burnt edge only the foot is seen, and
-    the point spread tells where its middle is.
-
-    Parameters
-    ----------
-    own : (5, p) array
-        Rows of the ellipse in the inverse of the normal matrix.
+    An edge that is seen as a whole hardly depends on it, unless the disc is hardly larger than the
+    blur. Of a burnt edge only the foot is seen, and the point spread tells where its middle is.
     """
-    if not fit.sample.is_burnt:
+    is_small = mean_radius_px(fit.state.geometry) < _FEW_BLURS * fit.state.blur.mean_sd_px
+    if not fit.sample.is_burnt and not is_small:
         return np.zeros(GEOMETRY_COUNT)
     by_kurtosis = levels_by_kurtosis(fit) / fit.sd
-    moved = own @ (fit.scaled @ (fit.misfit.weight * by_kurtosis))
+    terms = fit.scaled @ (fit.misfit.weight * by_kurtosis)
+    moved = np.linalg.solve(fit.normal, terms)[:GEOMETRY_COUNT]
     sd = fit.free.kurtosis_sd
     if _hidden_share(fit):
         # what is seen is no more than the foot, by which a kurtosis is found too small by half
