@@ -93,11 +93,7 @@ class DiscPixels:
         Derivatives are laid out as those of a plate: rows 0…4 by the geometry, row 5 zero, then by
         the blur.
         """
-        views, inverse = np.empty((_VIEW_ROWS, self.places_px.shape[1])), np.empty(3)
-        _meet_disc(geometry, self.places_px, inverse, views)
-        on_disc = np.zeros((PLATE_ROWS, views.shape[1]))
-        on_disc[0] = self.background
-        render(views, blur.vector, self.circles, self.starts, self.members, on_disc)
+        views, inverse, on_disc = self._rendered(geometry, blur)
         if self.kurtosis:
             by_kurtosis = self._by_kurtosis(views, blur, on_disc)
             on_disc[:_SHIFT_ROWS] += self.kurtosis * by_kurtosis
@@ -109,12 +105,22 @@ class DiscPixels:
 
     def by_kurtosis(self, geometry: Geometry, blur: Blur) -> FloatArray:
         """Return the derivative (n,) of the white share by the point spread's kurtosis."""
+        views, _, on_disc = self._rendered(geometry, blur)
+        return np.asarray(self._by_kurtosis(views, blur, on_disc)[0])
+
+    def _rendered(
+        self, geometry: Geometry, blur: Blur
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return views (6, n), the inverse stretch (3,), and the share with derivatives (9, n).
+
+        The latter are on the disc, by a Gaussian blur.
+        """
         views, inverse = np.empty((_VIEW_ROWS, self.places_px.shape[1])), np.empty(3)
         _meet_disc(geometry, self.places_px, inverse, views)
         on_disc = np.zeros((PLATE_ROWS, views.shape[1]))
         on_disc[0] = self.background
         render(views, blur.vector, self.circles, self.starts, self.members, on_disc)
-        return np.asarray(self._by_kurtosis(views, blur, on_disc)[0])
+        return views, inverse, on_disc
 
     def _by_kurtosis(self, views: FloatArray, blur: Blur, on_disc: FloatArray) -> FloatArray:
         """Return the derivative by the point spread's kurtosis, as `blurred_plate.kurtosis_row`.

@@ -161,9 +161,10 @@ def _smear_of(grey: GreyArray, outlines: Sequence[DiscOutline]) -> tuple[int, in
     """Return over how many grey values clipped pixels are smeared, by `find_smear`."""
     some = outlines[:: max(len(outlines) // _DISCS_OF_SMEAR, 1)]
     windows = [cut_disc_window(grey, outline_geometry(each), _BESIDE_PX) for each in some]
-    if not windows:
+    seen = [each for each in windows if len(each.levels)]  # predictions may lie outside
+    if not seen:
         return 0, 0
-    return find_smear([(each.levels, each.width) for each in windows], windows[0].levels_per_count)
+    return find_smear([(each.levels, each.width) for each in seen], seen[0].levels_per_count)
 
 
 def _measured(

@@ -148,15 +148,10 @@ def find_censoring(
         at_top = float(np.mean(levels == top))
         if at_top > _PILED_UP > float(np.mean(levels > _JUST_BELOW * top)) - at_top:
             high, brightest = top - 0.5 * levels_per_count, top
-    top_smear, bottom_smear = (
-        max(own, of_all) if near < _TELLING_PIXELS else own
-        for own, of_all, near in zip(
-            find_smear([(levels, width)], levels_per_count),
-            smear,
-            _pixels_near_ends(levels, levels_per_count)[:, : _MAX_SMEAR_COUNTS + 1].sum(axis=1),
-            strict=True,
-        )
-    )
+    own = find_smear([(levels, width)], levels_per_count)
+    near = _pixels_near_ends(levels, levels_per_count)[:, : _MAX_SMEAR_COUNTS + 1].sum(axis=1)
+    is_few = near < _TELLING_PIXELS
+    top_smear, bottom_smear = np.where(is_few, np.maximum(own, smear), own).tolist()
     high, low = high - top_smear * levels_per_count, low + bottom_smear * levels_per_count
     ceiling, floor = 1.0 if top_smear else math.inf, 0.0 if bottom_smear else -math.inf
     return Censoring(high, low, levels >= high, levels <= low, ceiling, floor, brightest)
