@@ -16,10 +16,13 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.covariance import PoseCovariance
 from kgcp.measurement.adjustment.fit_target import measure_by_model
-from kgcp.measurement.adjustment.two_poses import TwoPoses, advantage
+from kgcp.measurement.adjustment.problem import FitProblem
+from kgcp.measurement.adjustment.two_poses import TwoPoses, advantage, fit_at, fit_both_poses
+from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.records import InitialPose, Measurement
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Sensor, ToneCurve
+from kgcp.targets.layout import Target
 
 LENS = Camera(480, 340, 1310.0, 1306.0, 121.2, 91.7, -0.09, 0.06, 8e-4, -6e-4, -0.01)
 FILM = Sensor(tone=ToneCurve.FILM, sharpening=0.6, sharpening_px=1.1)
@@ -66,6 +69,25 @@ def test_from_straight_above_the_distance_is_found(
     start = start_near(LENS, above, np.random.default_rng(seed))
     seen = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
     check_distance(seen, pose)
+
+
+@pytest.mark.parametrize("scale", [0.997, 1.003])
+def test_the_other_pose_is_fitted_from_a_rough_distance(
+    target: Target,
+    camera: Camera,
+    place_plate: Callable[..., Pose],
+    draw_frame: Callable[..., GreyArray],
+    imaging_of: Callable[..., FitProblem],
+    scale: float,
+) -> None:
+    """It seemed hopeless before the first step, and the right one of two poses was not found."""
+    pose = place_plate((205.4, 190.7), 25.0, tilt_deg=10.0, way_deg=200.0, turn_deg=31.0)
+    grey = draw_frame((target, pose), blur_px=1.5)
+    problem = imaging_of(grey, camera, target, pose)
+    best = fit_both_poses(problem, pose, Blur(2.2, 2.2, 0.0)).best
+    fitted = best.parameters.pose
+    again = fit_at(best, Pose(fitted.rotation, scale * fitted.translation_m))
+    assert again.total == pytest.approx(best.total, abs=0.1)
 
 
 @pytest.mark.parametrize(("levels", "expected"), [(None, 10.0), (object(), 4.0)])
