@@ -111,9 +111,9 @@ class DiscPixels:
     def _rendered(
         self, geometry: Geometry, blur: Blur
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return views (6, n), the inverse stretch (3,), and the share with derivatives (9, n).
+        """Return views (6, n), inverse stretch (3,), and share with derivatives on the disc (9, n).
 
-        The latter are on the disc, by a Gaussian blur.
+        The blur is Gaussian here, without kurtosis.
         """
         views, inverse = np.empty((_VIEW_ROWS, self.places_px.shape[1])), np.empty(3)
         _meet_disc(geometry, self.places_px, inverse, views)

@@ -112,7 +112,7 @@ class CameraTone:
     prior: ProcessingPrior | None = None  # of tone curve and sharpening; None: nothing is learned
     blur_px: float = 0.0  # median of the discs that it was learned from; 0: none
     kurtosis: float = 0.0  # excess kurtosis of its point spread
-    kurtosis_sd: float = KURTOSIS_SD  # by how much it may be another
+    kurtosis_sd: float = KURTOSIS_SD  # its standard deviation
     is_curve_unknown: bool = False  # False: the curve is stated
     # By how much edges may be displaced by curves that a few discs do not tell apart [px]
     curve_spread_px: float = 0.0

@@ -54,13 +54,13 @@ _EXTRAPOLATED_SHARE = 0.025
 _BY_UNKNOWN_CURVE, _BY_UNKNOWN_CURVE_OF_BURNT = 0.15, 0.3
 # Compression of quality 92 and 85 displaces edges by 0.02 to 0.06 px, and where white is burnt by
 # 0.05 and 0.18 px (`srgb_jpeg`, `clipped_jpeg`). Burnt and with an unknown curve, it is 0.5 px
-# (`unknown_clipped_jpeg`, quality 92). If the curve could bend in each disc instead, it
-# would take that up, but displace centres where the light falls off: by 0.005 px at R 150 px, 1.9
-# deviations.
-_BY_COMPRESSION, _BY_COMPRESSION_OF_BURNT, _BY_BOTH_OF_BURNT = 0.08, 0.3, 0.7
+# (`unknown_clipped_jpeg`, quality 92). If the curve could bend in each disc instead, it would take
+# that up, but displace centres where the light falls off: by 0.005 px at R 150 px, 1.9 deviations.
+_BY_COMPRESSION, _BY_COMPRESSION_OF_BURNT, _BY_COMPRESSION_OF_BURNT_UNKNOWN = 0.08, 0.3, 0.7
 # A single disc may be too small to show smeared pixels (`find_smear`), and its surroundings too
 # even to show JPEG's blocks. Compression counts as found if more pixels than this share of the
-# clipped ones are within six grey values below them: without compression, 1 to 5 % are.
+# clipped ones are within six grey values below them. That holds for all of 448 single discs of R
+# 2.5 to 8 px in JPEGs (`clipped_jpeg`), and for 2 % of as many without compression.
 _BELOW_CLIPPED, _BELOW_COUNTS = 0.15, 6.0
 # Burnt discs whose radius is less than this many times the blur do not tell size from brightness:
 # at R 3 px, out of focus by 2 px, edges are displaced by 0.35 px (`defocused_clipped`).
@@ -79,7 +79,10 @@ _WIDE_GAP_PX = 4.0
 # of this (R 8 and 15 px), and twice this in one case of twelve.
 _BY_CURVE_PER_FALL = 0.05
 KURTOSIS_SD = 0.3
-"""Standard deviation of the excess kurtosis of any camera's point spread."""
+"""A-priori standard deviation of the excess kurtosis of a camera's point spread.
+
+Coded targets have a weaker prior: see `adjustment.spread_shape`.
+"""
 _SMALL_SHARE = 1e-3  # of the white share's change, for a numerical derivative
 
 
@@ -293,7 +296,9 @@ def _camera_displacement_px(fit: DiscFit) -> float:
     if fit.sample.is_burnt:
         by_curve = _BY_UNKNOWN_CURVE_OF_BURNT if free.is_curve_unknown else 0.0
         if free.is_compressed or _looks_smeared(fit.sample):
-            by_compression = _BY_BOTH_OF_BURNT if by_curve else _BY_COMPRESSION_OF_BURNT
+            by_compression = (
+                _BY_COMPRESSION_OF_BURNT_UNKNOWN if by_curve else _BY_COMPRESSION_OF_BURNT
+            )
         if mean_radius_px(fit.state.geometry) < _FEW_BLURS * blur_px:
             by_blur = _BY_BLUR_OF_BURNT
     elif free.tone is not Tone.LINEAR:

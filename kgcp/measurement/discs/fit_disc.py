@@ -110,7 +110,7 @@ class DiscUnknowns:
     is_curve_unknown: bool = False  # whether the tone curve is learned from discs
     is_compressed: bool = False  # whether the photograph is a JPEG, or was one
     curve_spread_px: float = 0.0  # by how much curves displace edges that a few discs leave open
-    kurtosis_sd: float = 0.0  # by how much it may be another
+    kurtosis_sd: float = 0.0  # standard deviation of the kurtosis
 
     @classmethod
     def of(

@@ -61,13 +61,13 @@ _MIN_SMEARED_AWAY = 0.2
 # Windows with fewer pixels within six grey values of the end do not tell smeared ones. Larger ones
 # of `ros10` do: the scatter of its centres would be 0.080 instead of 0.076 px.
 _TELLING_PIXELS = 100
+# Of the few pixels of a small disc, this share must be smeared (of more, eight pixels). With at
+# least eight in any case, single burnt bright discs in JPEGs of quality 92 were too large by 0.28
+# px at R 2.5 px and 0.14 px at 3 px, now by 0.19 and 0.05 px.
+_SMEARED_OF_FEW = 0.2
 # Largest shares of clipped pixels at which both levels are well seen: of all, and of the bright
 # ones, since a small bright disc fills little of its window
 _MUCH_CLIPPED, _MUCH_OF_BRIGHT = 0.05, 0.1
-# Of the few pixels of a small disc, this share must be smeared (of more, eight pixels). With at
-# least eight in any case, burnt bright discs of R 2.5 to 5 px in JPEGs of quality 92 were too large
-# by 0.28 to 0.01 px, 16 to 3 stated deviations.
-_SMEARED_OF_FEW = 0.2
 
 # If light is clipped before the noise is added (`Censoring.ceiling`), pixels below the clipping
 # limit are compared with the clipped model. This share of the model's excess over the ceiling still
@@ -148,10 +148,11 @@ def find_censoring(
         at_top = float(np.mean(levels == top))
         if at_top > _PILED_UP > float(np.mean(levels > _JUST_BELOW * top)) - at_top:
             high, brightest = top - 0.5 * levels_per_count, top
-    own = find_smear([(levels, width)], levels_per_count)
-    near = _pixels_near_ends(levels, levels_per_count)[:, : _MAX_SMEAR_COUNTS + 1].sum(axis=1)
-    is_few = near < _TELLING_PIXELS
-    top_smear, bottom_smear = np.where(is_few, np.maximum(own, smear), own).tolist()
+    top_smear, bottom_smear = find_smear([(levels, width)], levels_per_count)
+    if any(smear):
+        near = _pixels_near_ends(levels, levels_per_count)[:, : _MAX_SMEAR_COUNTS + 1].sum(axis=1)
+        of_all_top, of_all_bottom = np.where(near < _TELLING_PIXELS, smear, 0).tolist()
+        top_smear, bottom_smear = max(top_smear, of_all_top), max(bottom_smear, of_all_bottom)
     high, low = high - top_smear * levels_per_count, low + bottom_smear * levels_per_count
     ceiling, floor = 1.0 if top_smear else math.inf, 0.0 if bottom_smear else -math.inf
     return Censoring(high, low, levels >= high, levels <= low, ceiling, floor, brightest)
