@@ -30,6 +30,15 @@ def advantage_over(other: TargetFit, fit: TargetFit) -> float:
     return advantage
 
 
+def advantage_on_own_pixels(fit: TargetFit, other: TargetFit) -> float:
+    """Return by how much the log-likelihood of the pixels of `fit` is greater than by `other`.
+
+    Unlike `advantage_over`, this leaves out what only `other` explains, such as the grey values of
+    white that `fit` takes for clipped.
+    """
+    return _loss(other, fit.sample) - _loss(fit, fit.sample)
+
+
 def _loss_of_volume(fit: TargetFit) -> float:
     """Return −log of the share of the priors' volume that a fit leaves, up to a constant."""
     normal = normal_matrix(fit.scaled_jacobian, fit.misfit, fit.unknowns)

@@ -41,7 +41,8 @@ _LIT = 0.1  # plate that is so near the brightest plate is in full light
 # is for ink that compression has smoothed. Of 288 simulated plates by phones that are not burnt (R
 # 37 to 290 px; PNG, JPEG quality 95 and 92), none is taken for burnt. Of 48 burnt ones with R ≥ 150
 # px, 47 are. Of 16 smaller burnt ones with quality 92 only 6 are, as what compression leaves beside
-# edges looks like noise.
+# edges looks like noise: `extensions` compares fits there. With qualities of 75 to 88, a few that
+# are not burnt are taken for it, from R 78 px on; that costs precision alone.
 _NOISE_OF_BURNT = ((0.27, 0.4), (0.145, 0.7))
 _CENTRAL, _CENTRAL_SD = 0.7, 0.557  # share of the smallest values, and their RMS if normal
 # Second difference along both axes, scaled to the noise of a pixel: it is 0 for light that changes
@@ -88,27 +89,30 @@ def look_at_plateaus(problem: FitProblem, pose: Pose, sd_px: float) -> Plateaus 
     )
 
 
-def without_burnt_white(problem: FitProblem, plateaus: Plateaus) -> FitProblem:
-    """Return the problem with white taken for clipped, if it is burnt below the end of the range.
+def as_if_burnt(problem: FitProblem, plateaus: Plateaus) -> FitProblem | None:
+    """Return the problem with white taken for clipped, if it may be burnt below the range's end.
 
     Cameras that map tones locally, or to another exposure, do so after the sensor has clipped. The
     plate is brighter than it seems then, and the curve that displaces its edges has a corner that
-    three shapes cannot follow. Burnt white is recognised by its noise, which is less than rounding
-    alone makes.
+    three shapes cannot follow.
     """
-    shows_noise = problem.window.binning == 1 and not problem.is_ring_small
     ink, plate = plateaus.typical[0], plateaus.extremes[1]
     least, most = _BURNT_WHITE
-    if not shows_noise or not least < plate < most * problem.censoring.high:
-        return problem
+    is_shown = problem.window.binning == 1 and not problem.is_ring_small
+    if not is_shown or not least < plate < most * problem.censoring.high:
+        return None
+    return problem.with_burnt_white(plate, ink + _EDGE_OF_BURNT * (plate - ink))
+
+
+def is_white_without_noise(problem: FitProblem, plateaus: Plateaus) -> bool:
+    """Tell whether white has less noise than rounding alone makes, as only burnt white has."""
+    ink, plate = plateaus.typical[0], plateaus.extremes[1]
     dark, bright = plateaus.flat
     bright = bright[problem.window.smooth[bright] > plate - _LIT * (plate - ink)]
     if len(bright) < _FEWEST_PIXELS:
-        return problem
+        return False
     of_ink, of_plate = _noise_in_counts(problem, dark), _noise_in_counts(problem, bright)
-    if not any(of_plate < sd and of_plate < share * of_ink for sd, share in _NOISE_OF_BURNT):
-        return problem
-    return problem.with_burnt_white(plate, ink + _EDGE_OF_BURNT * (plate - ink))
+    return any(of_plate < sd and of_plate < share * of_ink for sd, share in _NOISE_OF_BURNT)
 
 
 def _noise_in_counts(problem: FitProblem, flat: IndexArray) -> float:

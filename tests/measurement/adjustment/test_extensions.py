@@ -95,6 +95,47 @@ def test_white_that_is_burnt_is_taken_for_clipped_over_all_bases(
         assert poses.best.sample.problem.burnt_white == 0.92
 
 
+@pytest.mark.parametrize(
+    ("has_noise", "white", "explains", "advantage", "is_burnt"),
+    [
+        (False, 0.85, False, 0.0, True),
+        (True, 0.91, True, 90.0, False),
+        (True, 0.93, True, 90.0, True),
+        (True, 0.93, True, 30.0, False),
+        (True, 0.93, True, None, True),  # the fit with the white that is seen has failed
+        (True, 0.93, False, 90.0, False),  # levels would vary with clipped white, too
+    ],
+)
+def test_white_is_burnt_if_it_has_no_noise_or_if_even_light_is_then_likelier(
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    has_noise: bool,
+    white: float,
+    explains: bool,
+    advantage: float | None,
+    is_burnt: bool,
+) -> None:
+    problem = stand_in(burnt_white=None, censoring=stand_in(high=1.0))
+    plain, burnt = stand_in(), stand_in(brightest=white)
+    monkeypatch.setattr(extensions, "as_if_burnt", lambda *_: burnt)
+    monkeypatch.setattr(extensions, "is_white_without_noise", lambda *_: not has_noise)
+    monkeypatch.setattr(extensions, "_fit_in_even_light", lambda *_: stand_in(best=stand_in()))
+    monkeypatch.setattr(extensions, "needs_varying_levels", lambda _: not explains)
+    monkeypatch.setattr(
+        extensions,
+        "advantage_on_own_pixels",
+        lambda fit, other: advantage if other is plain and fit is not plain else None,
+    )
+    pose, blur = Pose(np.eye(3), np.array([0.0, 0.0, 9.0])), Blur(0.5, 0.5, 0.0)
+    tried = None if advantage is None else plain
+    if not is_burnt:
+        extensions._raise_if_burnt(problem, pose, blur, stand_in(), tried)
+        return
+    with pytest.raises(extensions.WhiteIsBurnt) as burns:
+        extensions._raise_if_burnt(problem, pose, blur, stand_in(), tried)
+    assert burns.value.problem is burnt
+
+
 @pytest.mark.parametrize(("inflation", "is_start"), [(2.9, True), (3.9, False)])
 def test_only_a_fit_at_its_minimum_is_the_start_over_the_other_base(
     monkeypatch: pytest.MonkeyPatch, *, inflation: float, is_start: bool

@@ -14,9 +14,10 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.plateaus import (
     Plateaus,
+    as_if_burnt,
+    is_white_without_noise,
     look_at_plateaus,
     shadows_across,
-    without_burnt_white,
 )
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.targets.layout import Target
@@ -169,32 +170,50 @@ def noisy(problem: FitProblem, plate: float, of_ink: float, of_plate: float) -> 
 
 
 @pytest.mark.parametrize(
-    ("plate", "of_ink", "of_plate", "is_burnt"),
+    ("of_ink", "of_plate", "is_burnt"),
     [
-        (0.92, 1.0, 0.0, True),
-        (0.92, 1.0, 0.5, False),  # it shows noise as ink does
-        (0.92, 0.0, 0.0, False),  # an image without noise cannot show burnt white
-        (0.75, 1.0, 0.0, False),  # too dark
-        (1.0, 1.0, 0.0, False),  # seen clipped
+        (1.0, 0.0, True),
+        (1.0, 0.5, False),  # it shows noise as ink does
+        (0.0, 0.0, False),  # an image without noise cannot show burnt white
     ],
 )
-def test_white_without_noise_below_the_end_of_the_range_is_burnt(
+def test_burnt_white_has_no_noise(
+    look: Callable[..., tuple[FitProblem, Plateaus]],
+    target: Target,
+    place_plate: Callable[..., Pose],
+    *,
+    of_ink: float,
+    of_plate: float,
+    is_burnt: bool,
+) -> None:
+    problem = noisy(look(target)[0], 0.92, of_ink, of_plate)
+    plateaus = look_at_plateaus(problem, place_plate(CENTRE_PX, 60.0, tilt_deg=10.0), 0.8)
+    assert plateaus is not None
+    assert is_white_without_noise(problem, plateaus) == is_burnt
+
+
+@pytest.mark.parametrize(
+    ("plate", "may_be_burnt"),
+    [
+        (0.92, True),
+        (0.75, False),  # too dark
+        (1.0, False),  # seen clipped
+    ],
+)
+def test_white_below_the_end_of_the_range_may_be_burnt(
     look: Callable[..., tuple[FitProblem, Plateaus]],
     target: Target,
     place_plate: Callable[..., Pose],
     *,
     plate: float,
-    of_ink: float,
-    of_plate: float,
-    is_burnt: bool,
+    may_be_burnt: bool,
 ) -> None:
-    problem = noisy(look(target)[0], plate, of_ink, of_plate)
+    problem = noisy(look(target)[0], plate, 1.0, 0.0)
     plateaus = look_at_plateaus(problem, place_plate(CENTRE_PX, 60.0, tilt_deg=10.0), 0.8)
     assert plateaus is not None
-    seen = without_burnt_white(problem, plateaus)
-    if not is_burnt:
-        assert seen is problem
-        assert seen.brightest == 1.0
+    seen = as_if_burnt(problem, plateaus)
+    assert (seen is not None) == may_be_burnt
+    if seen is None:
         return
     limit = 0.08 + 0.8 * (plate - 0.08)
     assert seen.brightest == seen.burnt_white == pytest.approx(plate, abs=0.003)
@@ -208,7 +227,7 @@ def test_white_without_noise_below_the_end_of_the_range_is_burnt(
         replace(problem, outer_radius_px=12.0),
         replace(problem, window=replace(problem.window, binning=2)),
     ):
-        assert without_burnt_white(told_too_little, plateaus) is told_too_little
+        assert as_if_burnt(told_too_little, plateaus) is None
 
 
 def test_burnt_white_is_recognised_beside_shade(
@@ -225,6 +244,8 @@ def test_burnt_white_is_recognised_beside_shade(
     problem = replace(problem, window=replace(window, levels=levels, smooth=levels))
     plateaus = look_at_plateaus(problem, place_plate(CENTRE_PX, 60.0, tilt_deg=10.0), 0.8)
     assert plateaus is not None
-    seen = without_burnt_white(problem, plateaus)
+    assert is_white_without_noise(problem, plateaus)
+    seen = as_if_burnt(problem, plateaus)
+    assert seen is not None
     assert seen.burnt_white == pytest.approx(0.92, abs=0.01)
     assert not np.any(seen.censoring.at_high & (columns > CENTRE_PX[0]))
