@@ -141,7 +141,9 @@ restart_option = click.option(
     help="Discard the results of an interrupted run and start over.",
 )
 
-quiet_option = click.option("-q", "--quiet", "is_quiet", is_flag=True, help="Print errors only.")
+quiet_option = click.option(
+    "-q", "--quiet", "is_quiet", is_flag=True, help="Print errors and grave doubts only."
+)
 
 log_json_option = click.option(
     "--log-json",
