@@ -10,8 +10,11 @@ from pyproj.database import query_crs_info
 from pyproj.enums import PJType
 from pyproj.exceptions import ProjError
 
+from kgcp.georef.crs import WGS84_3D
+
 # Largest distance of the vehicle from the frames' own positions. In a wrong zone it is larger.
 _MAX_DISTANCE_M = 5000.0
+_DEGREE_M = 111_000.0  # of a meridian
 # datums of satellite positioning, preferred in this order
 _SATELLITE_DATUMS = ("ETRS89", "WGS 84", "NAD83", "GDA2020", "JGD2011")
 
@@ -30,15 +33,13 @@ def is_geographic_place(x: float, y: float) -> bool:
     return abs(x) <= 180.0 and abs(y) <= 90.0
 
 
-def projected_crs_near(
-    x: float, y: float, longitude_deg: float, latitude_deg: float
-) -> tuple[str, ...]:
-    """Return the projected CRS of EPSG that put a map point near a known place.
+def crs_near(x: float, y: float, longitude_deg: float, latitude_deg: float) -> tuple[str, ...]:
+    """Return the CRS that put a map point near a known place: WGS 84, or projected ones of EPSG.
 
     Parameters
     ----------
     x, y : float
-        Easting and northing of the point, in an unknown CRS [m].
+        Longitude and latitude [deg], or easting and northing [m], of the point.
     longitude_deg, latitude_deg : float
         The place, WGS 84.
 
@@ -47,6 +48,9 @@ def projected_crs_near(
     tuple of str
         Those with datums of satellite positioning first, each once.
     """
+    east_deg = (x - longitude_deg) * math.cos(math.radians(latitude_deg))
+    if math.hypot(east_deg, y - latitude_deg) * _DEGREE_M < _MAX_DISTANCE_M:
+        return (WGS84_3D,)
     area = AreaOfInterest(longitude_deg, latitude_deg, longitude_deg, latitude_deg)
     infos = query_crs_info("EPSG", [PJType.PROJECTED_CRS], area, contains=True)
     near = []

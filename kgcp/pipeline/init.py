@@ -305,9 +305,16 @@ def _surveyed_positions(
 
 
 def _reference_parts(contents: FolderContents) -> Iterator[Part]:
-    if contents.references:
-        name = contents.relative(contents.references[0])
-        yield DraftKey("poses", name)
-        yield InitFinding("reference", f"poses of the camera, from {name}")
+    names = [*map(contents.relative, contents.references)]
+    if len(names) == 1:
+        yield DraftKey("poses", names[0])
+        yield InitFinding("reference", f"poses of the camera, from {names[0]}")
     else:
-        yield DraftKey("poses", None, "poses of the camera from an adjustment", '"reference.csv"')
+        if names:
+            yield Gap(
+                "reference",
+                f"several files have poses of the camera: {', '.join(names)}",
+                "leave one of them in the folder, or fill in [reference]",
+            )
+        example = ('"reference.csv"', "poses of the camera from an adjustment")
+        yield DraftKey("poses", None, example[1], example[0], is_missing=bool(names))

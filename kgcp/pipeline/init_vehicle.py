@@ -9,7 +9,7 @@ import numpy as np
 
 from kgcp.errors import SettingError
 from kgcp.georef.crs import WGS84_3D, longitude_latitude, parse_crs
-from kgcp.georef.crs_guess import is_geographic_place, projected_crs_near, utm_crs
+from kgcp.georef.crs_guess import crs_near, is_geographic_place, utm_crs
 from kgcp.io.files.gps_time import TimeSystem, first_day_near
 from kgcp.io.files.time_text import NUMBER, half_of_time, names_zone, parse_time
 from kgcp.io.flight.folder import FolderContents
@@ -28,6 +28,7 @@ _WORDS = {
 }
 _GEOGRAPHIC = frozenset({"sbet", "rtklib", "waypoint"})  # formats that need no crs
 _WEEK_S = 2e6  # seconds of a week are less than this; Unix seconds are far larger
+_USUAL_CRS = "EPSG:25832"  # of an example to be filled in
 _SHOWN_CRS = 3
 _SHOWN_FILES = 5
 _CRS_REMEDY = "write crs = … into flight.toml: the CRS of the surveyed coordinates"
@@ -127,7 +128,12 @@ def crs_parts(
     source = "" if file is None else contents.relative(file.path)
     if surveyed and surveyed[0].first_xy is not None:
         path = contents.relative(surveyed[0].path)
-        yield from _crs_parts_by_place(path, surveyed[0].first_xy, place)
+        if surveyed[0].is_geographic:
+            comment = f"longitude, latitude and ellipsoidal height in {path}"
+            yield DraftKey("crs", WGS84_3D, comment)
+            yield InitFinding("crs", f"{WGS84_3D}: {comment}")
+        else:
+            yield from _crs_parts_by_place(path, surveyed[0].first_xy, place)
     elif start is None:
         why = f"{source} cannot be read" if source else "nothing in the folder has coordinates"
         yield from _unknown_crs_parts(why)
@@ -159,13 +165,10 @@ def _crs_parts_by_place(
 ) -> Iterator[Part]:
     """Yield the CRS in which some coordinates are near the place of the flight."""
     silent = f"{source} does not say in which CRS its coordinates are"
-    if is_geographic_place(*xy):
-        comment = f"longitude, latitude and ellipsoidal height in {source}"
-        yield DraftKey("crs", WGS84_3D, comment)
-        yield InitFinding("crs", f"{WGS84_3D}: {comment}")
-    elif place is None:
-        yield from _unknown_crs_parts(silent)
-    elif not (near := projected_crs_near(*xy, *place)):
+    if place is None:
+        likely = WGS84_3D if is_geographic_place(*xy) else _USUAL_CRS
+        yield from _unknown_crs_parts(silent, likely)
+    elif not (near := crs_near(*xy, *place)):
         why = f"{silent}, and in no CRS of EPSG are they near the place of the flight"
         yield from _unknown_crs_parts(why)
     elif len(near) == 1:
@@ -178,7 +181,7 @@ def _crs_parts_by_place(
         yield from _unknown_crs_parts(f"{silent}; by the flight's place it may be {shown}", near[0])
 
 
-def _unknown_crs_parts(why: str, likely: str = "EPSG:25832") -> Iterator[Part]:
+def _unknown_crs_parts(why: str, likely: str = _USUAL_CRS) -> Iterator[Part]:
     comment = "CRS of all coordinates; heights are ellipsoidal"
     yield DraftKey("crs", None, comment, f'"{likely}"', is_missing=True)
     yield Gap("crs", why, _CRS_REMEDY)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import tomllib
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -36,6 +37,7 @@ from tests.systems import not_on_windows
 
 PLAN = plan(3, seed=1)
 TARGET = ("--diameter", "0.9", "--code", "0,43,78,180")
+PLACE: dict[int, object] = {1: "N", 2: (48, 8, 0.0), 3: "E", 4: (11, 33, 0.0)}  # by EXIF
 ARM = ("--lever-arm", *map(str, LEVER_ARM))
 TARGETS_TOML = """
 [[target]]
@@ -516,3 +518,49 @@ def test_exif_times_that_are_coarse_or_missing_are_named(
     text = " ".join(init(tmp_path, "--crs", "EPSG:25832", *TARGET).stderr.split())
     for line in lines:
         assert line in text
+
+
+@pytest.mark.parametrize(
+    ("place", "file", "text", "crs", "said"),
+    [
+        (PLACE, "points.csv", "name,x,y,z\nA,11.551,48.134,545", "EPSG:4979", "is near the place"),
+        (
+            PLACE,
+            "points.csv",
+            "name,x,y,z\nA,1285740,6129060,545",
+            "EPSG:3857",
+            "is near the place",
+        ),
+        (PLACE, "points.csv", "name,x,y,z\nA,10.5,22.25,1.2", None, "in no CRS of EPSG"),
+        ({}, "points.csv", "name,x,y,z\nA,10.5,22.25,1.2", None, "points.csv does not say"),
+        ({}, "points.csv", "name,Lon,Lat,h\nA,11.551,48.134,545", "EPSG:4979", "in points.csv"),
+        ({}, "track.csv", "time,x,y,z\n1760000000,10.5,22.25,1", None, "track.csv does not say"),
+        ({}, "track.csv", "time,e,n,h\n1760000000,10.5,22.25,1", None, "track.csv does not say"),
+    ],
+)
+def test_small_numbers_are_degrees_only_if_named_so_or_near_the_frames(
+    tmp_path: Path, place: dict[int, object], file: str, text: str, crs: str | None, said: str
+) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(IFD.GPSInfo).update(place)
+    Image.new("L", (64, 48)).save(tmp_path / "0.jpg", exif=exif)
+    (tmp_path / "targets.toml").write_text(TARGETS_TOML, encoding="utf-8")
+    (tmp_path / file).write_text(f"{text}\n", encoding="utf-8")
+    assert said in " ".join(init(tmp_path).stderr.split())
+    made = tomllib.loads((tmp_path / "flight.toml").read_text(encoding="utf-8"))
+    assert (made.get("crs"), made.get("vehicle", {}).get("crs")) == (crs, None)
+
+
+def test_poses_of_the_camera_are_taken_from_the_only_file_that_has_them(tmp_path: Path) -> None:
+    Image.new("L", (64, 48)).save(tmp_path / "0.jpg")
+    poses = "frame,x,y,z,omega_deg,phi_deg,kappa_deg\n0.jpg,689000,5336000,600,0,0,0\n"
+    (tmp_path / "reference.csv").write_text(poses, encoding="utf-8")
+    assert "reference poses of the camera, from reference.csv" in (
+        " ".join(init(tmp_path).stderr.split())
+    )
+    (tmp_path / "flight.toml").unlink()
+    (tmp_path / "second.csv").write_text(poses, encoding="utf-8")
+    said = " ".join(init(tmp_path).stderr.split())
+    assert "several files have poses of the camera: reference.csv, second.csv" in said
+    made = tomllib.loads((tmp_path / "flight.toml").read_text(encoding="utf-8"))
+    assert "reference" not in made

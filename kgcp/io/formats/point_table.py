@@ -41,6 +41,11 @@ class PointTable:
         return None if x is None or y is None else (x, y)
 
     @property
+    def is_geographic(self) -> bool:
+        """Whether x, y are longitude and latitude [deg] by their names."""
+        return self.table.name_of("x").lower().startswith("lon")
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of all points, in their order.
 

@@ -6,7 +6,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from kgcp.georef.crs_guess import is_geographic_place
 from kgcp.io.files.csv_sniff import SniffedTable, sniff_table
 from kgcp.io.files.gps_time import TimeSystem
 from kgcp.io.files.sniff import ForeignFile
@@ -59,7 +58,8 @@ class ForeignTable:
     """A trajectory's table."""
 
     table: SniffedTable
-    is_geographic: bool  # whether x, y are longitude and latitude [deg]
+    # whether x, y are longitude and latitude [deg] by their names; small numbers may be metres
+    is_geographic: bool
 
     @property
     def has_attitude(self) -> bool:
@@ -84,10 +84,8 @@ def recognised_table(file: ForeignFile) -> ForeignTable | None:
         known = {"time": _TIMES, **positions, "z": _HEIGHT, **_ATTITUDE, **_DEVIATIONS}
         table = sniff_table(file, known)
         if table is not None and {"time", "x", "y", "z"} <= table.cells.keys():
-            x, y = table.number("x"), table.number("y")
-            is_angular = x is not None and y is not None and is_geographic_place(x, y)
-            is_named_so = table.name_of("x") != "x" and is_geographic
-            return ForeignTable(_whole_groups(table), is_named_so or is_angular)
+            is_named_so = is_geographic and table.name_of("x") != "x"
+            return ForeignTable(_whole_groups(table), is_named_so)
     return None
 
 
