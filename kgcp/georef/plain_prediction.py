@@ -88,7 +88,7 @@ def predict_plain(
     camera: Camera,
     rotations: Rotations,
 ) -> Predictions:
-    """Predict plain targets in a frame; those behind the camera are left out.
+    """Predict plain targets in a frame.
 
     The standard deviations follow from those of the frame's orientation and of the target's
     position, and with a rolling shutter from that of the motion until the target's row.
@@ -99,22 +99,18 @@ def predict_plain(
         The known ones.
     """
     sights = _sights(targets, orientation, positions, camera, rotations)
-    all_predictions = {
+    return {
         target.name: _predicted(target, sights[target.name], orientation, positions)
         for target in targets
     }
-    return {name: value for name, value in all_predictions.items() if value is not None}
 
 
 def _predicted(
     target: PlainTarget,
-    sight: _Sight | None,
+    sight: _Sight,
     orientation: FrameOrientation,
     positions: TargetPositions,
-) -> PlainPrediction | None:
-    """Predict one target; None if it is not in front of the camera."""
-    if sight is None:
-        return None
+) -> PlainPrediction:
     distance_m = float(np.linalg.norm(sight.position_m))
     ray = sight.position_m / distance_m
     sd_log_distance = math.sqrt(max(0.0, float(ray @ sight.cov_m2 @ ray))) / distance_m
@@ -140,7 +136,7 @@ def predict_places(
 ) -> dict[str, PredictedPlace]:
     """Predict the places of static targets, as `predict_plain`."""
     sights = _sights(targets, orientation, positions, camera, rotations)
-    return {name: sight.place for name, sight in sights.items() if sight is not None}
+    return {name: sight.place for name, sight in sights.items()}
 
 
 def _sights(
@@ -149,7 +145,7 @@ def _sights(
     positions: TargetPositions,
     camera: Camera,
     rotations: Rotations,
-) -> dict[str, _Sight | None]:
+) -> dict[str, _Sight]:
     unknown = SceneRotation.unknown(camera)
     return {
         each.name: _Sight.of(
@@ -175,22 +171,20 @@ class _Sight:
         positions: TargetPositions,
         camera: Camera,
         rotation: SceneRotation,
-    ) -> Self | None:
-        """Return it at the moment of its row; None if it is not in front of the camera."""
+    ) -> Self:
+        """Return it at the moment of its row."""
         static = positions.static[target.name]
         camera_from_enu = orientation.enu_from_camera.T
         from_centre_m = static.position_m - orientation.centre_m
         sight_m = camera_from_enu @ from_centre_m
         centre_px = visible_pixel(camera, sight_m)
-        if not np.isfinite(centre_px).all():
-            return None
         cov_m2 = np.zeros((3, 3)) if static.cov_m2 is None else static.cov_m2
         min_sd_px = _UNSTATED_SD_PX
         if orientation.cov is not None:
             min_sd_px = _MIN_SD_PX
             cov_m2 = cov_m2 + place_covariances(orientation.cov, from_centre_m)
         cov_m2 = camera_from_enu @ cov_m2 @ camera_from_enu.T
-        if camera.readout_s:
+        if camera.readout_s and np.isfinite(centre_px).all():
             # the scene turns until the target's row is exposed
             velocity, middle_m, delay_s = np.array(rotation.velocity_rad_s), sight_m, 0.0
             for _ in range(_ROW_STEPS):
@@ -198,14 +192,19 @@ class _Sight:
                 sight_m = rotation_about(delay_s * velocity) @ middle_m
                 centre_px = visible_pixel(camera, sight_m)
                 if not np.isfinite(centre_px).all():
-                    return None
+                    break
             by_turn = delay_s * rotation.sd_rad_s * cross_matrix(sight_m)
             cov_m2 = cov_m2 + by_turn @ by_turn.T
-        by_position = _pixel_by_position(camera, sight_m)
+        px_per_m = camera.mean_focal_px / float(np.linalg.norm(sight_m))
+        if np.isfinite(centre_px).all():
+            by_position = _pixel_by_position(camera, sight_m)
+            cov_px2 = by_position @ cov_m2 @ by_position.T
+        else:
+            cov_px2 = px_per_m**2 * float(np.linalg.eigvalsh(cov_m2)[-1]) * np.eye(2)
         place = PredictedPlace(
             centre_px,
-            by_position @ cov_m2 @ by_position.T + min_sd_px**2 * np.eye(2),
-            0.5 * target.outer_diameter_m * camera.mean_focal_px / float(np.linalg.norm(sight_m)),
+            cov_px2 + min_sd_px**2 * np.eye(2),
+            0.5 * target.outer_diameter_m * px_per_m,
         )
         return cls(sight_m, cov_m2, place)
 

@@ -31,7 +31,8 @@ _LEAST_COSINE = 0.17  # of the angle between normal and ray: 80°
 class PredictedPlace:
     """Where a static target must be in a frame."""
 
-    centre_px: FloatArray  # (2,): projected centre [px]
+    # (2,): projected centre [px]; NaN: behind the camera, or where its distortion does not hold
+    centre_px: FloatArray
     cov_px2: FloatArray  # (2, 2): its covariance [px²]
     radius_px: float  # largest radius of its outer circle [px]
 
@@ -40,7 +41,7 @@ class PredictedPlace:
     ) -> float | None:
         """Return how far off the target's place is, if this contradicts the prediction [px].
 
-        None: the standard deviations explain it.
+        None: the standard deviations explain it. Infinite: it should not be seen at all.
 
         Parameters
         ----------
@@ -49,6 +50,8 @@ class PredictedPlace:
         sigmas : float
             How many standard deviations it may be off.
         """
+        if np.isnan(self.centre_px).any():
+            return math.inf if _is_sure(self.cov_px2, self.radius_px) else None
         off_px = place_px - self.centre_px
         cov_px2 = self.cov_px2 + sd_px**2 * np.eye(2)
         is_far = float(off_px @ np.linalg.solve(cov_px2, off_px)) > sigmas**2
@@ -62,7 +65,7 @@ class PlainPrediction:
     Attributes
     ----------
     centre_px : (2,) array
-        Projected centre [px].
+        Projected centre [px]; NaN as in `PredictedPlace`.
     cov_px2 : (2, 2) array
         Covariance of the centre [px²].
     position_m : (3,) array
@@ -91,6 +94,9 @@ class PlainPrediction:
     def __str__(self) -> str:
         """Text for the detail of a row."""
         x, y = self.centre_px
+        if math.isnan(x):
+            where = "behind the camera" if self.position_m[2] <= 0.0 else "far aside"
+            return f"expected by {self.source} {where}"
         return (
             f"expected by {self.source} at ({x:.0f}, {y:.0f}) ± {self.sd_px:.1f} px, radius"
             f" {self.radius_px:.1f} px"
@@ -110,7 +116,7 @@ class PlainPrediction:
     @property
     def sd_px(self) -> float:
         """Largest standard deviation of the centre over all directions [px]."""
-        return math.sqrt(float(np.linalg.eigvalsh(self.cov_px2)[-1]))
+        return _sd_px(self.cov_px2)
 
     @property
     def reach_px(self) -> float:
@@ -120,7 +126,7 @@ class PlainPrediction:
     @property
     def is_sure(self) -> bool:
         """Whether it is certain enough to look there."""
-        return self.reach_px <= _FARTHEST * self.radius_px
+        return _is_sure(self.cov_px2, self.radius_px)
 
     def is_from_behind(self) -> bool:
         """Tell whether its plane turns away from the camera, or is seen edge on."""
@@ -132,6 +138,8 @@ class PlainPrediction:
     def is_outside(self, camera: Camera) -> bool:
         """Tell whether no part of the target can be in the frame."""
         x, y = self.centre_px
+        if math.isnan(x):
+            return self.is_sure
         reach = self.radius_px + self.reach_px
         return bool(max(-x, x - camera.width + 1.0, -y, y - camera.height + 1.0) > reach)
 
@@ -140,6 +148,14 @@ class PlainPrediction:
         x, y = self.centre_px
         margin = min(x, camera.width - 1.0 - x, y, camera.height - 1.0 - y)
         return bool(margin >= self.radius_px)
+
+
+def _sd_px(cov_px2: FloatArray) -> float:
+    return math.sqrt(float(np.linalg.eigvalsh(cov_px2)[-1]))
+
+
+def _is_sure(cov_px2: FloatArray, radius_px: float) -> bool:
+    return SIGMAS * _sd_px(cov_px2) <= _FARTHEST * radius_px
 
 
 def smallest_radius_px(target: PlainTarget) -> float:

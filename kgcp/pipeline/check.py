@@ -250,13 +250,14 @@ def _expected_text(inputs: FlightInputs) -> str:
     camera, target = inputs.flight.camera, inputs.flight.all_targets[0]
     radius_px_at_1_m = 0.5 * target.outer_diameter_m * camera.mean_focal_px
     if inputs.expected_radii_px is None:
-        least = DetectSettings().min_radius_px
+        least, condition = DetectSettings().min_radius_px, ""
         if isinstance(target, PlainTarget):
             least = least_plain_px(target)
+            condition = " if [reference] poses, coded targets or marks (--places) predict its place"
         return (
             f"{target.name} has a radius of {radius_px_at_1_m / _TYPICAL_M:.0f} px"
             f" at {_TYPICAL_M:g} m;"
-            f" it is found to some {radius_px_at_1_m / least:.0f} m ({least:g} px)"
+            f" it is found to some {radius_px_at_1_m / least:.0f} m ({least:g} px){condition}"
         )
     if not len(inputs.expected_radii_px):
         return f"{target.name} is in no frame, by the reference poses"

@@ -424,10 +424,12 @@ def _contradiction(wrong: ContradictedMarks) -> str:
     mark = "correct the marks, or the targets' position_m"
     is_most = 2 * wrong.contradicted > wrong.compared
     remedy = f"{poses}; else {mark}" if is_most else f"{mark}; else {poses}"
+    off = f"is off by {wrong.off_px:.0f} px"
+    if math.isinf(wrong.off_px):
+        off = "should be out of sight"
     return (
         f"{wrong.contradicted} of {counted(wrong.compared, 'mark')} are not where the reference"
-        f" poses have the targets, that of {wrong.target!r} in {wrong.frame} by"
-        f" {wrong.off_px:.0f} px; {remedy}"
+        f" poses have the targets: {wrong.target!r} in {wrong.frame} {off}; {remedy}"
     )
 
 

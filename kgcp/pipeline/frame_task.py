@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -177,7 +178,10 @@ def _contradiction(
     off_px = [each for each in compared if each is not None]
     if len(off_px) < _LEAST_CONTRADICTIONS or 2 * len(off_px) <= len(compared):
         return None
-    return f"the reference pose has coded targets {max(off_px):.0f} px off their places"
+    worst = "out of sight"
+    if math.isfinite(max(off_px)):
+        worst = f"{max(off_px):.0f} px off their places"
+    return f"the reference pose has coded targets {worst}"
 
 
 def _frame_time(

@@ -213,9 +213,7 @@ def marks_against_reference(
         rotations = _rotations(priors[frame])
         places = predict_places(static, orientations[frame], positions, flight.camera, rotations)
         for mark in marks[frame]:
-            predicted = places.get(mark.target)
-            if predicted is None:
-                continue
+            predicted = places[mark.target]
             compared += 1
             place_px = np.array([mark.place.x_px, mark.place.y_px])
             off_px = predicted.contradiction_px(place_px, mark.place.sd_px, _MARK_SIGMAS)

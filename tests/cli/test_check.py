@@ -74,6 +74,24 @@ def test_the_worst_of_uneven_deviations_is_named(flight: Path) -> None:
     assert "σ 120/120/250 cm\n" in check(flight).stdout.replace("\n              ", " ")
 
 
+def test_what_a_flight_lacks_is_on_the_page(flight: Path) -> None:
+    """Standard deviations, and, for a plain target, what would predict its place."""
+    change(flight, "flight.toml", "[frames]\n", "[frames]\nexif_fallback = true\n")
+    lines = (flight / "reference.csv").read_text(encoding="utf-8").splitlines()
+    poses = [",".join(line.split(",")[:7]) for line in lines]
+    (flight / "reference.csv").write_text("\n".join(poses), encoding="utf-8")
+    page = " ".join(check(flight).stdout.split())
+    assert "24 of 24 frames, from frames.csv or EXIF: " in page
+    assert "24 of 24 frames have a pose, no standard deviations" in page
+    text = (flight / "flight.toml").read_text(encoding="utf-8")
+    plain = ('name = "P"', 'shape = "disc"', 'polarity = "dark"', "diameter_m = 0.4")
+    place = "position_m = [689590.0, 5336240.0, 545.0]"
+    lines = [text.partition("[[target]]")[0], "[[target]]", *plain, place]
+    (flight / "flight.toml").write_text("\n".join(lines), encoding="utf-8")
+    page = " ".join(check(flight).stdout.split())
+    assert "(3 px) if [reference] poses, coded targets or marks (--places) predict its" in page
+
+
 def test_json_has_facts_and_doubts(flight: Path) -> None:
     change(flight, "flight.toml", "fx = 1903.0", "fx = 8.8")
     result = check(flight, "--json")

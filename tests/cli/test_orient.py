@@ -577,10 +577,13 @@ def field_flight(rendered_field: tuple[Path, list[Pose]], tmp_path: Path) -> Pat
     return Path(shutil.copytree(rendered_field[0], tmp_path / "flight"))
 
 
+@pytest.mark.parametrize("response", ["linear", "unknown"])
 def test_a_field_gives_poses_in_its_own_coordinate_frame(
-    field_flight: Path, rendered_field: tuple[Path, list[Pose]]
+    field_flight: Path, rendered_field: tuple[Path, list[Pose]], response: str
 ) -> None:
     folder, (_, poses) = field_flight, rendered_field
+    toml = folder / "flight.toml"
+    toml.write_text(toml.read_text(encoding="utf-8").replace('"linear"', f'"{response}"'))
     result = run("orient", folder, "--field", folder / "field.toml", "--json")
     assert result.exit_code == 0, result.stderr
     summary = json.loads(result.stdout)
@@ -600,6 +603,17 @@ def test_a_field_gives_poses_in_its_own_coordinate_frame(
     result = run("orient", folder, "--field", folder / "field.toml", "--frames", "void*")
     assert result.exit_code == 1
     assert "no frame can be oriented by the field 'board': fewer than six discs" in result.stderr
+
+
+def test_the_usual_reason_is_named_if_no_frame_can_be_oriented(field_flight: Path) -> None:
+    frames = field_flight / "frames"
+    (frames / "a_void.png").write_bytes(b"no image")
+    shutil.copy(frames / "void.png", frames / "void_2.png")
+    result = run(
+        "orient", field_flight, "--field", field_flight / "field.toml", "--frames", "*void*"
+    )
+    assert result.exit_code == 1
+    assert "; of 3 frames 2 have this reason: fewer than six discs" in result.stderr
 
 
 @pytest.mark.parametrize(

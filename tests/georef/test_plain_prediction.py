@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from kgcp.errors import Reason
 from kgcp.geometry.attitude import cross_matrix
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.plain_prediction import (
@@ -21,7 +23,9 @@ from kgcp.georef.plain_prediction import (
 from kgcp.georef.target_positions import static_position
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import read_flight
+from kgcp.measurement.plain_target import measure_plain
 from kgcp.measurement.plate_prior import SceneRotation
+from kgcp.measurement.records import Miss
 from tests.plain_flight import CAMERA, CRS, ORIGIN_MAP, TARGETS, PlainFlight
 
 
@@ -48,6 +52,37 @@ def test_deviations_cover_the_errors_of_the_poses(made: Path) -> None:
         assert one.normal.direction_camera @ centre_m > 0.9 * np.linalg.norm(centre_m)
         assert np.linalg.norm(one.position_m - centre_m) < 0.1
         assert "the reference" in str(one)
+
+
+@pytest.mark.parametrize(
+    ("turned_deg", "where"), [(180.0, "behind the camera"), (75.0, "far aside")]
+)
+def test_targets_that_a_known_pose_has_out_of_sight_are_not_unpredicted(
+    made: Path, turned_deg: float, where: str
+) -> None:
+    flight = read_flight(made)
+    data = FlightData(flight, ["f_0.png"])
+    positions, camera = data.static_positions, replace(CAMERA, k1=-0.3, readout_s=0.02)
+    pose = reference_orientations(data.reference_poses, positions.local_frame)["f_0.png"]
+    turn = Rotation.from_euler("x", turned_deg, degrees=True).as_matrix()
+    away = replace(pose, enu_from_camera=pose.enu_from_camera @ turn)
+    grey = np.full((camera.height, camera.width), 90, np.uint8)
+    (target, *_) = flight.plain_targets
+    prediction = predict_plain([target], away, positions, camera, {})[target.name]
+    outcome = measure_plain(grey, camera, target, prediction)
+    assert isinstance(outcome, Miss)
+    assert outcome.reason is Reason.OUT_OF_VIEW
+    assert outcome.detail == f"expected by the reference {where}, outside the frame"
+    place = predict_places([target], away, positions, camera, {})[target.name]
+    assert place.contradiction_px(np.array([100.0, 100.0])) == math.inf
+    assert pose.cov is not None
+    vague = replace(away, cov=pose.cov + np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]))
+    prediction = predict_plain([target], vague, positions, camera, {})[target.name]
+    outcome = measure_plain(grey, camera, target, prediction)
+    assert isinstance(outcome, Miss)
+    assert outcome.reason is Reason.NO_PREDICTION
+    place = predict_places([target], vague, positions, camera, {})[target.name]
+    assert place.contradiction_px(np.array([100.0, 100.0])) is None
 
 
 @pytest.mark.parametrize("stated", [(), ("sd_position_m",), ("sd_angle_deg",)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,12 +33,15 @@ def require_a_pose(frames: Sequence[OrientedFrame[PoseT]], flight: Flight, shown
     Raises
     ------
     KgcpError
-        With the reason of the first frame.
+        With the most common reason.
     """
     if not any(each.pose is not None for each in frames):
-        reason = frames[0].reason if frames else "there is no frame"
+        reason, count = Counter(each.reason for each in frames).most_common(1)[0]
+        which = ""
+        if count < len(frames):
+            which = f"; of {len(frames)} frames {count} have this reason"
         raise KgcpError(
-            f"{flight.frames_folder}: no frame can be oriented by the {shown}: {reason}"
+            f"{flight.frames_folder}: no frame can be oriented by the {shown}{which}: {reason}"
         )
 
 
