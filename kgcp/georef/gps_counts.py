@@ -24,7 +24,8 @@ def gps_count_remedy(frames_s: float, trajectory_s: float) -> str | None:
         )
     if 0.0 <= frames_s < _TWO_WEEKS_S <= trajectory_s:
         return (
-            "the frames' times are seconds of a GPS week: write them as UTC,"
+            "the frames' times are seconds of a GPS week: subtract the leap seconds (18 since"
+            " 2017), write them with their day, such as"
             f" {date_of(trajectory_s):%Y-%m-%dT%H:%M:%SZ}, and run 'kgcp detect' again"
         )
     for whose, behind_s in (

@@ -65,16 +65,18 @@ class LocalFrame:
             not installed, or if the origin lies outside the projection's domain.
         """
         draft = cls(crs, np.zeros(3), np.eye(3), *_operations_of(crs, where), where)
-        geodetic_origin = draft._geodetic(np.reshape(np.asarray(origin_map, float), (1, 3)))
+        origin = np.reshape(np.asarray(origin_map, float), (1, 3))
+        geodetic_origin = draft._geodetic(origin)
         return replace(
             draft,
-            origin_ecef_m=draft._ecef(geodetic_origin)[0],
+            origin_ecef_m=draft._ecef(geodetic_origin, origin)[0],
             ecef_from_enu=_level_axes(geodetic_origin)[0],
         )
 
     def enu_from_map(self, xyz: FloatArray) -> FloatArray:
         """Transform map points (n, 3) into the ENU frame (n, 3) [m]."""
-        ecef = self._ecef(self._geodetic(np.asarray(xyz, dtype=np.float64)))
+        points = np.asarray(xyz, dtype=np.float64)
+        ecef = self._ecef(self._geodetic(points), points)
         return (ecef - self.origin_ecef_m) @ self.ecef_from_enu
 
     def map_from_enu(self, enu: FloatArray) -> FloatArray:
@@ -87,7 +89,7 @@ class LocalFrame:
     def semi_axes_m(self) -> tuple[float, float]:
         """Semi-major and semi-minor axis of the ellipsoid [m]."""
         axes = np.array([[0.0, 0.0, 0.0], [0.0, 0.5 * np.pi, 0.0]])
-        equator, pole = self._ecef(axes)
+        equator, pole = self._ecef(axes, axes)
         return float(equator[0]), float(pole[2])
 
     def geodetic_deg(self, enu: FloatArray) -> FloatArray:
@@ -156,15 +158,17 @@ class LocalFrame:
         ecef = np.asarray(enu, dtype=np.float64) @ self.ecef_from_enu.T + self.origin_ecef_m
         return self._transform(self._ecef_from_geodetic, ecef, TransformDirection.INVERSE)
 
-    def _ecef(self, geodetic: FloatArray) -> FloatArray:
-        return self._transform(self._ecef_from_geodetic, geodetic)
+    def _ecef(self, geodetic: FloatArray, given: FloatArray) -> FloatArray:
+        return self._transform(self._ecef_from_geodetic, geodetic, given=given)
 
     def _transform(
         self,
         transformer: Transformer,
         points: FloatArray,
         direction: TransformDirection = TransformDirection.FORWARD,
+        given: FloatArray | None = None,
     ) -> FloatArray:
+        """Transform points (n, 3); an error shows those `given` (n, 3), from which they come."""
         radians = transformer is self._ecef_from_geodetic
         try:
             x, y, z = points.T
@@ -174,7 +178,8 @@ class LocalFrame:
         result = np.column_stack(columns).astype(np.float64)
         invalid = np.flatnonzero(~np.isfinite(result).all(axis=1))
         if invalid.size:
-            point = ", ".join(f"{value:.10g}" for value in points[invalid[0]])
+            shown = points if given is None else given
+            point = ", ".join(f"{value:.10g}" for value in shown[invalid[0]])
             raise KgcpError(
                 f"{self._where} {self.crs!r} does not cover the point ({point});"
                 " give the CRS of the coordinates, x = easting or longitude first"
@@ -304,9 +309,10 @@ class CrsTransform:
             time_s=time_s,
             keys=(CRS_KEY, where),
         )
-        draft = cls(source, source, between, where)
+        where_named = f"{where} {crs!r}"
+        draft = cls(source, source, between, where_named)
         target = LocalFrame.at(crs, draft.positions(np.reshape(near_map, (1, 3)))[0], where)
-        return cls(source, target, between, where)
+        return cls(source, target, between, where_named)
 
     def positions(self, xyz: FloatArray) -> FloatArray:
         """Transform points (n, 3) of the source map into the other one (n, 3)."""
@@ -316,7 +322,7 @@ class CrsTransform:
         except ProjError as error:
             text = " ".join(str(error).split())
             raise KgcpError(
-                f"{self._where}: points in {self.source.crs!r} cannot be transformed to that CRS"
+                f"{self._where}: points in {self.source.crs!r} cannot be transformed to it"
                 f" ({text}); give one that covers the flight"
             ) from error
 

@@ -162,8 +162,12 @@ def gps_s(time: str) -> float:
 
 def rewrite_times(path: Path, clock: Callable[[float], str]) -> None:
     head, *rows = path.read_text(encoding="utf-8").splitlines()
-    cells = [row.split(",", 1) for row in rows]
-    lines = [f"{clock(gps_s(time))},{rest}" for time, rest in cells]
+    column = head.split(",").index("time")
+    lines = []
+    for row in rows:
+        cells = row.split(",")
+        cells[column] = clock(gps_s(cells[column]))
+        lines.append(",".join(cells))
     path.write_text("\n".join([head, *lines]), encoding="utf-8")
 
 
@@ -189,6 +193,16 @@ def test_gps_times_of_a_trajectory_are_named(
 ) -> None:
     rewrite_times(measured.path / "vehicle.csv", clock)
     assert words in measured.fails("export-gcp")
+
+
+def test_frames_timed_by_seconds_of_a_gps_week_are_told_what_to_subtract(
+    unmeasured: SampleFlight,
+) -> None:
+    rewrite_times(unmeasured.path / "frames.csv", lambda gps: f"{gps % _WEEK_S:.6f}")
+    result = unmeasured.run("check")
+    assert result.exit_code == 1
+    said = " ".join(result.stdout.split())
+    assert "the frames' times are seconds of a GPS week: subtract the leap seconds (18" in said
 
 
 def test_the_keys_that_are_named_for_a_gps_week_are_right(measured: SampleFlight) -> None:

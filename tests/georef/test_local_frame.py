@@ -157,6 +157,12 @@ def test_heights_above_a_geoid_are_transformed_or_refused_but_never_taken_as_ell
 def test_coordinates_outside_the_projection_are_an_error() -> None:
     with pytest.raises(KgcpError, match="does not cover the point"):
         LocalFrame.at("EPSG:25831", np.array([1e30, 0.0, 0.0]))
+    metres = np.array([689_588.057, 5_336_252.148, 556.8])
+    words = r"does not cover the point \(689588.057, 5336252.148, 556.8\); give the CRS"
+    with pytest.raises(KgcpError, match=words):
+        LocalFrame.at("EPSG:4326", metres)
+    with pytest.raises(KgcpError, match=words):
+        LocalFrame.at("EPSG:4326", np.array([11.5, 48.1, 556.8])).enu_from_map(metres[None])
 
 
 def test_the_axes_are_those_of_east_and_north_also_at_the_antimeridian() -> None:
