@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.network import covariance
 from kgcp.network.adjust import adjust_network
 from kgcp.network.covariance import bend_cofactors, fitting_covariances, precision
 from kgcp.network.equations import computed, moved, network_rows, reduce_poses, view_rows
@@ -72,6 +73,19 @@ def test_points_may_be_eliminated_instead_of_poses_and_bends(rng: np.random.Gene
     assert np.allclose(by_points.bends, by_poses.bends, atol=1e-12)
     assert np.allclose(by_points.translations, by_poses.translations, atol=1e-12)
     assert np.allclose(by_points.cameras, by_poses.cameras, rtol=1e-9, atol=1e-9)
+
+
+def test_cofactors_of_bends_are_the_same_by_both_eliminations(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bars connect the points of a field, which then cannot be eliminated."""
+    made = bent(rng)
+    solution = adjust_network(made.network, start(made, rng))
+    by_points = bend_cofactors(made.network, solution)
+    factor = precision(made.network, solution).variance_factor
+    monkeypatch.setattr(covariance, "can_eliminate_points", lambda _: False)
+    assert np.allclose(bend_cofactors(made.network, solution), by_points, rtol=1e-9)
+    assert precision(made.network, solution).variance_factor == pytest.approx(factor, rel=1e-9)
 
 
 def test_bends_and_camera_are_as_accurate_as_stated(

@@ -78,12 +78,25 @@ def test_the_written_truth_agrees_with_the_discs_in_the_photographs(folder: Path
         assert 0.7 <= float(row["gain"]) <= 1.0
 
 
-def test_calibration_recovers_the_simulated_camera(folder: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "field",
+    [
+        FIELD,
+        replace(
+            FIELD, diameter_m=0.012, marks=(Mark(1, 1, 0.012, 0.005),), is_diameter_stated=False
+        ),
+    ],
+)
+def test_calibration_recovers_the_simulated_camera(
+    folder: Path, tmp_path: Path, field: Field
+) -> None:
+    """Diameters that are not stated are those of the photographs, whatever is assumed."""
     settings = CalibrationSettings(lens=LensModel.RADIAL)
     options = CalibrationOptions(settings, Response.LINEAR, Operator.CENTROID, jobs=0)
     photos = find_photos([folder / "photos"])
-    made = calibrate_photos(photos, FIELD, tmp_path, options, NoProgress())
+    made = calibrate_photos(photos, field, tmp_path, options, NoProgress())
     assert not made.misses
+    assert made.calibration.field.radii_m() == pytest.approx([0.008] * 20, rel=0.01)
     found, sd = made.calibration.camera, np.sqrt(made.calibration.covariance.cov.diagonal())
     for index, name in enumerate(CALIBRATION_PARAMETERS[:5]):
         error = getattr(found, name) - getattr(CAMERA, name)

@@ -12,6 +12,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, ReferencePoses, opk_from_rotation
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
+from kgcp.georef.scene_rotation import CameraMotions
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition, TargetPositions, Vehicle
 from kgcp.georef.trajectory import Motion
@@ -345,6 +346,22 @@ def test_positions_that_poses_confirm_raise_no_doubt(sd_m: float | None) -> None
         scale = 1.0 + 0.005 * rng.standard_normal()
         flight = GroundFlight(seed=seed, stated_diameter_m=0.9 * scale)
         assert check_by_poses(flight, SD_M * rng.standard_normal((4, 3)), sd_m) == ()
+
+
+def test_a_camera_that_moves_while_its_frames_are_read_raises_no_doubt() -> None:
+    """It flies down its image: what is read later is displaced outwards."""
+    flight, camera = GroundFlight(), replace(CAMERA, readout_s=0.1)
+    velocity_m_s = 30.0 * flight.rotations[:, :, 1]
+    sightings = [
+        replace(one, pose=shifted(one.pose, np.array([0.0, -30.0 * one.delay_s(camera), 0.0])))
+        for one in seen(flight)
+        if one.pose is not None
+    ]
+    rest, sds = np.zeros_like(velocity_m_s), np.full(flight.frames, 0.01)
+    motions = CameraMotions(velocity_m_s, sds, rest, 0.1 * sds, np.ones(flight.frames, np.bool_))
+    inputs = sightings, stated(flight), reference(flight, 0.02), camera, flight.local_frame
+    assert [*check_places(*inputs)] != []
+    assert [*check_places(*inputs, motions)] == []
 
 
 @pytest.mark.parametrize("names", ["A", "ABCD"])
