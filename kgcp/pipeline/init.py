@@ -316,5 +316,5 @@ def _reference_parts(contents: FolderContents) -> Iterator[Part]:
                 f"several files have poses of the camera: {', '.join(names)}",
                 "leave one of them in the folder, or fill in [reference]",
             )
-        example = ('"reference.csv"', "poses of the camera from an adjustment")
-        yield DraftKey("poses", None, example[1], example[0], is_missing=bool(names))
+        comment = "poses of the camera from an adjustment"
+        yield DraftKey("poses", None, comment, '"reference.csv"', is_missing=bool(names))
