@@ -35,6 +35,7 @@ from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.flight_inputs import FlightInputs, missing_frames, naming_causes
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.checks.doubt import Doubt, ranked
+from kgcp.quality.checks.place import check_export_crs
 from kgcp.quality.consistency import Consistency
 from kgcp.quality.number_text import rounded
 from kgcp.settings import require_kind
@@ -139,6 +140,8 @@ def make_gcps(
         time_s = next((point.time_s for point in gcps if point.time_s is not None), None)
         transform = CrsTransform.to(crs, local_frame, gcps[0].position_map, time_s=time_s)
         gcps, local_frame = transform_gcps(gcps, transform), transform.target
+        places = np.array([point.position_map for point in gcps])
+        doubts = (*doubts, *check_export_crs(local_frame.crs, places))
     return GcpSet(
         flight=flight,
         crs=local_frame.crs,

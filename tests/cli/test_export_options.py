@@ -330,6 +330,10 @@ def test_points_exported_in_another_crs_are_the_same_places(folder: Path) -> Non
         assert stream.read().count("EPSG:4326") == _FRAMES - 1
 
 
+def test_a_crs_whose_map_is_not_to_scale_is_doubted(folder: Path) -> None:
+    assert "kgcp: doubt: EPSG:3857 stretches" in _export(folder, "--crs", "EPSG:3857").stderr
+
+
 def test_an_unusable_crs_is_a_one_line_error(folder: Path) -> None:
     for crs in ("nonsense", "EPSG:2263", "EPSG:4978"):
         result = CliRunner().invoke(main, ["export-gcp", str(folder), "--crs", crs])

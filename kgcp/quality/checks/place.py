@@ -72,8 +72,42 @@ def check_grid_scale(crs: str, position_map: FloatArray) -> Iterator[Doubt]:
     place = longitude_latitude(crs, _median(position_map[:, :2])[None])[0]
     if not np.isfinite(place).all():
         return
-    longitude, latitude = place.tolist()
-    scale = grid_scale(crs, longitude, latitude)
+    remedy = (
+        f"give the region's own projection as crs in flight.toml, for example"
+        f" {utm_crs(*place.tolist())}; a trajectory with longitude and latitude is transformed,"
+        " other coordinates must be exported anew"
+    )
+    yield from _doubts_of_scale(crs, place, remedy)
+
+
+def check_export_crs(crs: str, position_map: FloatArray) -> Iterator[Doubt]:
+    """Yield the doubt about a CRS that points are transformed into.
+
+    Parameters
+    ----------
+    position_map : (n, 2 or 3) array
+        Places of the points in that CRS.
+    """
+    xy = (median_place if is_geographic(crs) else _median)(position_map[:, :2])
+    place = longitude_latitude(crs, xy[None])[0]
+    if not np.isfinite(place).all():
+        return
+    remedy = f"name a CRS of this region, for example --crs {utm_crs(*place.tolist())}"
+    area, outside = area_of_use(crs), _outside(area_of_use(crs), crs, xy)
+    if area is None or outside <= _MAX_OUTSIDE_DEG:
+        yield from _doubts_of_scale(crs, place, remedy)
+        return
+    yield mild(
+        Cause.CRS,
+        f"the points are {_spot(*place.tolist())}, {outside:.0f}° outside the area of {crs}"
+        f" ({_short(area.name)})",
+        remedy,
+        {"outside_deg": outside},
+    )
+
+
+def _doubts_of_scale(crs: str, place_deg: FloatArray, remedy: str) -> Iterator[Doubt]:
+    scale = grid_scale(crs, *place_deg.tolist())
     if abs(scale - 1.0) <= _MAX_STRETCH:
         return
     change = "stretches" if scale > 1.0 else "shrinks"
@@ -81,9 +115,7 @@ def check_grid_scale(crs: str, position_map: FloatArray) -> Iterator[Doubt]:
         Cause.GRID_SCALE,
         f"{crs} {change} horizontal lengths by {100.0 * abs(scale - 1.0):.2g} % here, but not"
         " heights: adjustments that take its coordinates for metres distort the scene",
-        f"give the region's own projection as crs in flight.toml, for example"
-        f" {utm_crs(longitude, latitude)}; a trajectory with longitude and latitude is transformed,"
-        " other coordinates must be exported anew",
+        remedy,
         {"scale": scale},
     )
 
@@ -126,7 +158,7 @@ def _spot(longitude_deg: float, latitude_deg: float) -> str:
 def _short(name: str) -> str:
     """Return the name of a region; a long one is cut after one of its parts."""
     if len(name) <= _MAX_NAME_LENGTH:
-        return name
+        return name.removesuffix(".")
     end = max(name.rfind(mark, 0, _MAX_NAME_LENGTH) for mark in ";,:")
     return f"{name[: end if end > 0 else _MAX_NAME_LENGTH]} …"
 

@@ -7,7 +7,12 @@ from kgcp.georef.crs import area_of_use, longitude_latitude
 from kgcp.quality.checks.camera_position import check_altitude, check_camera_position
 from kgcp.quality.checks.doubt import Cause
 from kgcp.quality.checks.frame_header import FrameHeader
-from kgcp.quality.checks.place import check_grid_scale, check_place, place_text
+from kgcp.quality.checks.place import (
+    check_export_crs,
+    check_grid_scale,
+    check_place,
+    place_text,
+)
 
 # CRS, x and y of a place where it is used
 PLACES = [
@@ -38,6 +43,25 @@ def test_coordinates_in_the_area_raise_no_doubt(crs: str, x: float, y: float) ->
 def test_maps_that_are_not_to_scale_are_doubted(crs: str, x: float, y: float) -> None:
     doubts = [*check_grid_scale(crs, np.array([[x, y, 500.0], [x + 1e-4, y, 500.0]]))]
     assert [doubt.code for doubt in doubts] == [Cause.GRID_SCALE] * (crs == "EPSG:3857")
+    exported = [*check_export_crs(crs, np.array([[x, y, 500.0], [x + 1e-4, y, 500.0]]))]
+    assert [doubt.code for doubt in exported] == [Cause.GRID_SCALE] * (crs == "EPSG:3857")
+
+
+@pytest.mark.parametrize(
+    ("crs", "x", "y", "outside"),
+    [
+        ("EPSG:32732", 689586.0, 15336252.0, "48° outside the area of EPSG:32732 (Between 6°E"),
+        ("EPSG:3031", 3.4e6, 16.9e6, "outside the area of EPSG:3031 (Antarctica); name"),
+    ],
+)
+def test_points_are_not_exported_to_another_region_unnoticed(
+    crs: str, x: float, y: float, outside: str
+) -> None:
+    (doubt,) = check_export_crs(crs, np.array([[x, y, 500.0]]))
+    assert not doubt.is_grave
+    assert doubt.code is Cause.CRS
+    assert outside in f"{doubt.sentence}; {doubt.remedy}"
+    assert doubt.remedy.startswith("name a CRS of this region, for example --crs EPSG:326")
 
 
 def test_the_scale_of_a_map_is_that_of_mercator_s_projection() -> None:
