@@ -16,7 +16,7 @@ from kgcp.errors import SettingError
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.settings import require_range
 
-LEAST_POINTS, MOST_POINTS = 6, 5000
+LEAST_POINTS, MOST_POINTS = 6, 10_000
 """Numbers of discs of a field. Fewer would determine a pose, but hardly check it."""
 
 _MAX_DISC_M = 3.0  # diameter; so millimetres given as metres are noticed from 3 mm on
@@ -130,7 +130,7 @@ class Field:
         require_hole("inner_diameter_m", self.inner_diameter_m, self.diameter_m)
         for sd in self.flat_sd_m:
             require_range("flat_sd_m", sd, 0.0, 1.0, unit="m", open_low=True)
-        if not LEAST_POINTS <= self.columns * self.rows <= 2 * MOST_POINTS:
+        if not LEAST_POINTS <= len(self._places()) <= MOST_POINTS:
             raise SettingError(
                 "columns",
                 f"{self.columns} x {self.rows} is not a field of {LEAST_POINTS} to {MOST_POINTS}"

@@ -215,3 +215,26 @@ def test_impossible_fields_are_refused(change: dict[str, object], key: str) -> N
     with pytest.raises(SettingError) as caught:
         Field("f", GridKind.SQUARE, **(values | change))  # type: ignore[arg-type]  # wrong on purpose
     assert caught.value.key == key
+
+
+@pytest.mark.parametrize(
+    ("kind", "columns", "rows", "is_field"),
+    [
+        (GridKind.SQUARE, 100, 100, True),
+        (GridKind.SQUARE, 101, 100, False),
+        (GridKind.HEXAGONAL, 200, 100, True),  # every second place has a disc
+        (GridKind.HEXAGONAL, 201, 100, False),
+        (GridKind.HEXAGONAL, 3, 3, False),
+    ],
+)
+def test_the_limits_of_a_field_are_those_that_its_refusal_names(
+    kind: GridKind,
+    columns: int,
+    rows: int,
+    is_field: bool,  # noqa: FBT001 - a parameter of the test
+) -> None:
+    if is_field:
+        assert len(Field("f", kind, columns, rows, 0.025, 0.012).names()) == 10_000
+    else:
+        with pytest.raises(SettingError, match=f"{columns} x {rows} is not .* 6 to 10000 discs"):
+            Field("f", kind, columns, rows, 0.025, 0.012)
