@@ -20,12 +20,16 @@ from kgcp.cli import main
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, rotation_about
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.io.flight.field_file import field_toml
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.tables.detections import DETECTION_COLUMNS, read_detections
 from kgcp.io.tables.parquet import write_table
+from kgcp.network.ground.position_check import FastCamera
+from kgcp.network.ground.target_moves import MovedTarget
 from kgcp.pipeline.calibration.simulation import FieldSimulation
 from kgcp.pipeline.flight_inputs import outdated_poses
+from kgcp.pipeline.ground.orient import FlightPoses
 from kgcp.quality.checks.doubt import Cause
 from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, photograph
 from kgcp.simulation.imaging import Optics, Sensor
@@ -696,3 +700,13 @@ def test_a_target_on_a_vehicle_is_compared_with_its_trajectory(tmp_path: Path) -
     result = run("orient", folder)
     assert result.exit_code == 0, result.stderr
     assert re.search(r"doubt: D on the vehicle is 0\.2\d? m beside .* of 6\)", result.stderr)
+
+
+def test_the_doubt_about_a_fast_camera_is_one_sentence() -> None:
+    """Unlike the others it had two, of which the second looked like the end of the line."""
+    flight = read_flight(Path(__file__).parents[2] / "sample_flight")
+    local_frame = LocalFrame.at("EPSG:25832", np.array([689400.0, 5336200.0, 545.0]))
+    fast = FastCamera(MovedTarget("C", "7.jpg", 0.02, 40.0))
+    (doubt,) = FlightPoses(flight, (), local_frame, {}, fast).doubts
+    assert "or C was moved" in doubt
+    assert ". " not in doubt

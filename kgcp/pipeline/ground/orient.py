@@ -183,8 +183,8 @@ class FlightPoses:
             return (
                 "the camera moves faster than motion_sd_deg_s"
                 f" ({self.flight.camera.motion_sd_deg_s:g}°/s) says while its frames are read out,"
-                f" or {self._suspect(wrong.otherwise)}; poses may be off by more than is stated."
-                " Give the frames' times (eight in a row, 0.5 s apart at most, show the motion), or"
+                f" or {self._suspect(wrong.otherwise)}; poses may be off by more than is stated;"
+                " give the frames' times (eight in a row, 0.5 s apart at most, show the motion), or"
                 " state how fast it may be (8 m/s at 30 m is 15°/s), and repeat 'kgcp detect'"
             )
         if isinstance(wrong, WrongPosition):
