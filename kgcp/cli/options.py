@@ -54,18 +54,32 @@ class LocalPath(click.Path):
         ctx: click.Context | None,
     ) -> Any:  # noqa: ANN401
         """Return the path of a text, or end with wrong usage."""
+        _require_no_option(str(value), param)
         if "://" in str(value):
             self.fail(f"{value} is a URL; name a file or folder of this machine.", param, ctx)
         return super().convert(value, param, ctx)
 
 
+def _require_no_option(text: str, parameter: click.Parameter | None) -> None:
+    """End with wrong usage if an option whose path was forgotten has taken the next option."""
+    if isinstance(parameter, click.Option) and text.startswith("-"):
+        raise click.BadParameter(
+            f"{text} looks like an option, not like a file or folder; name one (./{text} if it"
+            " is called so).",
+            param=parameter,
+        )
+
+
 def _place(
     context: click.Context,  # noqa: ARG001 - click's signature
-    parameter: click.Parameter,  # noqa: ARG001
+    parameter: click.Parameter,
     value: str | None,
 ) -> Path | StoredFolder | None:
     """Distinguish the URL of a folder, `s3://…`, `gs://…` or `file://…`, from a path."""
-    return None if value is None else _place_of(value)
+    if value is None:
+        return None
+    _require_no_option(value, parameter)
+    return _place_of(value)
 
 
 def _places(

@@ -143,6 +143,14 @@ def test_a_url_is_no_path_of_this_machine(arguments: list[str]) -> None:
     assert f"{arguments[-1]} is a URL; name a file or folder of this machine" in result.stderr
 
 
+@pytest.mark.parametrize("option", ["--overlay", "--out", "--places"])
+def test_an_option_is_no_path_of_the_option_before_it(tmp_path: Path, option: str) -> None:
+    """A contact sheet would be written into a folder named -q."""
+    result = CliRunner().invoke(main, ["detect", str(tmp_path), option, "-q"])
+    assert result.exit_code == 2
+    assert f"Invalid value for '{option}': -q looks like an option" in result.stderr
+
+
 def test_an_error_names_an_option_with_hyphens_between_its_words(tmp_path: Path) -> None:
     result = CliRunner().invoke(main, ["detect", str(tmp_path), "--jobs", "0", "--min-score", "2"])
     assert result.stderr.startswith("kgcp: error: --min-score: 2 is out of range; ")
