@@ -47,10 +47,13 @@ def test_other_encodings_are_named(measured: SampleFlight, name: str) -> None:
     path = measured.path / name
     text = path.read_text(encoding="utf-8")
     path.write_bytes(text.encode("utf-16"))
-    assert re.search("(is|but) UTF-16.*; save it as (text in )?UTF-8", measured.fails(TABLES[name]))
+    assert re.search("(is|but) UTF-16.*; save it as UTF-8", measured.fails(TABLES[name]))
     path.write_bytes(f"{text}# Überführung\n".encode("latin-1"))
     line = measured.fails(TABLES[name])
     assert "but of another encoding (Latin-1 or Windows-1252?); save it as UTF-8" in line
+    path.write_bytes(b"PK\x03\x04\x14\0\x06\0\x08\0!\0\xb5\xff")
+    line = measured.fails(TABLES[name])
+    assert re.search("(is|but) a spreadsheet or archive.*; export a spreadsheet as CSV", line)
 
 
 @pytest.mark.parametrize("name", ["vehicle.csv", "reference.csv"])
@@ -126,7 +129,9 @@ def test_a_flight_toml_of_another_encoding_is_refused(
     unmeasured.edit(('name = "sample"', 'name = "Straße"'))
     path = unmeasured.path / "flight.toml"
     path.write_bytes(path.read_text(encoding="utf-8").encode(encoding))
-    assert re.search(f"is not UTF-8 but .*{words}.*; save it as UTF-8", unmeasured.fails("detect"))
+    assert re.search(
+        f"is not UTF-8 but .*{words}.*; save it as plain text in UTF-8", unmeasured.fails("detect")
+    )
 
 
 def test_a_folder_in_place_of_a_calibration_file_is_named(unmeasured: SampleFlight) -> None:

@@ -19,6 +19,9 @@ MOST_BYTES = 1 << 29
 """Of a file that is read as a whole: a large reconstruction has a tenth of it."""
 _LONGEST_LINE = 1 << 20  # characters
 _HEAD = 4096  # bytes that tell an encoding
+UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+ARCHIVES = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0", b"\x1f\x8b")
+"""How spreadsheets (.xlsx and .ods, .xls) and archives (.zip, .gz) begin."""
 _UNTOLD = 1 << 20  # bytes, where the system does not tell
 _REFUSED_NAMES = {errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL}
 LARGEST = 1e15
@@ -148,21 +151,32 @@ def read_lines(path: Path, toml_key: str) -> Iterator[str]:
             yield from _bounded_lines(path, stream)
     except UnicodeDecodeError as error:
         with path.open("rb") as start:
-            likely = likely_encoding(start.read(_HEAD))
-        raise KgcpError(f"{path}: is not text in UTF-8 but {likely}; save it as UTF-8") from error
+            head = start.read(_HEAD)
+        raise KgcpError(
+            f"{path}: is not text in UTF-8 but {likely_encoding(head)}; {text_remedy(head)}"
+        ) from error
     except OSError as error:
         raise unreadable(path, error, f"correct {toml_key}") from error
 
 
 def likely_encoding(content: bytes) -> str:
     """Return in words the probable kind of a content that is not UTF-8."""
-    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+    if content.startswith(UTF_16):
         return "UTF-16"
-    if content.startswith(b"PK\x03\x04"):
+    if content.startswith(ARCHIVES):
         return "a spreadsheet or archive"
     if b"\0" in content[:_HEAD]:
         return "a binary file"
     return "of another encoding (Latin-1 or Windows-1252?)"
+
+
+def text_remedy(content: bytes) -> str:
+    """Return what makes text in UTF-8 of a content that is not."""
+    if content.startswith(ARCHIVES):
+        return "export a spreadsheet as CSV, or unpack an archive"
+    if b"\0" in content[:_HEAD] and not content.startswith(UTF_16):
+        return "name a text file"
+    return "save it as UTF-8"
 
 
 def _bounded_lines(path: Path, stream: TextIO) -> Iterator[str]:

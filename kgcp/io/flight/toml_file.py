@@ -72,7 +72,9 @@ def read_toml(path: Path, known: Sequence[str], named_by: str) -> tuple[TomlTabl
         text = content.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
         likely = likely_encoding(content)
-        raise KgcpError(f"{path}: is not UTF-8 but {likely}; save it as UTF-8") from error
+        raise KgcpError(
+            f"{path}: is not UTF-8 but {likely}; save it as plain text in UTF-8"
+        ) from error
     if _LONG_KEY.search(text):
         raise KgcpError(f"{path}: has a key of very many parts; delete it")
     try:

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from kgcp.io.files.csv_columns import SEPARATOR_REMEDY, foreign_separator
+from kgcp.io.files.safe_read import ARCHIVES, UTF_16, likely_encoding, text_remedy
 from kgcp.io.files.sniff import ForeignFile
 
 Read = TypeVar("Read")
 """Type of the function that reads a file of some format."""
 
 _CSV_NAMES = ("time", "frame", "x", "y", "z")  # columns; every CSV file has some of them
-_OTHER_TEXTS = {b"\xff\xfe": "UTF-16", b"\xfe\xff": "UTF-16", b"PK": "a spreadsheet or archive"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,9 +55,9 @@ class Registry(Generic[Read]):
         for name, (matches, _) in self.formats.items():
             if matches(file):
                 return name
-        for start, text in _OTHER_TEXTS.items():
-            if file.head.startswith(start):
-                raise file.error(f"is {text}, not {self.kind}", "save it as text in UTF-8")
+        if file.head.startswith(UTF_16 + ARCHIVES):
+            likely = likely_encoding(file.head)
+            raise file.error(f"is {likely}, not {self.kind}", text_remedy(file.head))
         separator = foreign_separator(file.first_line, _CSV_NAMES)
         if "csv" in self.formats and separator is not None:
             raise file.error(

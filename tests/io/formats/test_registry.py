@@ -18,8 +18,10 @@ HEADER = "time,x,y,z,roll_deg,pitch_deg,heading_deg\n"
             HEADER.replace(",", ";").encode(),
             "format: its cells are separated by ';'; .*save it with",
         ),
-        (HEADER.encode("utf-16"), "is UTF-16, not a .*; save it as text in UTF-8"),
-        (b"PK\x03\x04", "is a spreadsheet or archive, not a .*; save it as text"),
+        (HEADER.encode("utf-16"), "is UTF-16, not a .*; save it as UTF-8"),
+        (b"PK\x03\x04", "is a spreadsheet or archive, not a .*; export a spreadsheet as CSV"),
+        (b"\xd0\xcf\x11\xe0", "is a spreadsheet or archive, not a .*; export a spreadsheet"),
+        (b"\x1f\x8b\x08\0", "is a spreadsheet or archive, not a .* or unpack an archive"),
         (b"words\n", "of a known format \\([a-z0-9, ]+\\); "),
     ],
 )
