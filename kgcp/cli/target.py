@@ -36,7 +36,7 @@ _JOINED_SD_M = 0.0005  # of places in a plane on sheets that are cut and joined 
     "--new",
     "new_count",
     type=click.IntRange(1, 50),
-    help="Propose this number of new targets, with codes as far apart as possible.",
+    help="Propose this number of new targets, with codes far apart.",
 )
 @click.option(
     "--field",
@@ -152,7 +152,7 @@ def command(
 
     load_matplotlib()  # before the drawing of sheets does
     from kgcp.errors import SettingError
-    from kgcp.io.flight.flight import read_printed_targets
+    from kgcp.io.flight.flight import read_printed_targets, refuse_to_lose_targets
     from kgcp.io.flight.target_table import write_target_tables
     from kgcp.io.print.write import check_stems, write_sheets
     from kgcp.pipeline.workspace import results_folder
@@ -213,6 +213,7 @@ def command(
         for target in targets
     ]
     folder = out or (Path("targets") if flight is None else results_folder(flight) / "targets")
+    refuse_to_lose_targets(targets, known, folder)
     files = [
         path
         for target, sheets in zip(targets, layouts, strict=True)
@@ -240,6 +241,7 @@ def _draw_field(
 
     from kgcp.errors import KgcpError, KgcpWarning, SettingError
     from kgcp.io.files.atomic import write_bytes
+    from kgcp.io.files.safe_read import is_file
     from kgcp.io.flight.field_file import field_toml, read_field, refuse_to_overwrite_field
     from kgcp.io.print.write import write_sheets
     from kgcp.targets.fields.artwork import draw_field
@@ -258,8 +260,15 @@ def _draw_field(
     folder = out or Path("targets")
     description = folder / "field.toml"
     refuse_to_overwrite_field(text, [description])
+    content = field_toml(field).encode()
+    if is_file(description) and description.read_bytes() != content:
+        raise KgcpError(
+            f"{description}: describes another field, or this one with measured lengths; write to"
+            " another folder, or delete the file",
+            option="out",
+        )
     files = write_sheets(sheets, "field", folder, formats, dpi)
-    write_bytes(description, field_toml(field).encode())
+    write_bytes(description, content)
     files.append(description)
     if as_json:
         counts = {"field": field.name, "discs": len(field.names()), "sheets": len(sheets)}

@@ -111,6 +111,31 @@ def test_new_targets_differ_from_the_known_ones(flight: Path, tmp_path: Path) ->
     assert len(read_printed_targets(flight)) == 4, "none of them could be confused"
 
 
+def test_new_targets_do_not_replace_those_of_an_earlier_run(tmp_path: Path) -> None:
+    """They may have been printed, and their codes stand nowhere else."""
+    arguments = ("--new", "2", "--diameter", "0.15", "--format", "svg", "--out", tmp_path)
+    assert run(*arguments).exit_code == 0
+    assert run(*arguments).exit_code == 0, "the same again"
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    one = run("--code", "0,40,90,255", "--diameter", "0.5", "--format", "svg", "--out", tmp_path)
+    assert one.exit_code == 1
+    assert "targets.toml: has T1, T2 of an earlier run" in one.stderr
+    assert "or delete the file if these are not printed (--out)" in one.stderr
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_targets_of_flight_toml_are_written_again_after_a_change(flight: Path) -> None:
+    assert run(flight, "--new", "1", "--format", "svg").exit_code == 0
+    refused = run(flight, "--target", "A", "--format", "svg")
+    assert refused.exit_code == 1
+    assert "has T1 of an earlier run" in refused.stderr
+    (flight / "kgcp" / "targets" / "targets.toml").unlink()
+    assert run(flight, "--format", "svg").exit_code == 0
+    changed = TABLES.replace("_diameter_m = 0.15\n", "_diameter_m = 0.1501\n")
+    (flight / "flight.toml").write_text(changed, encoding="utf-8")
+    assert run(flight, "--target", "A", "--format", "svg").exit_code == 0
+
+
 def test_codes_with_a_rotational_symmetry_cause_a_warning(flight: Path) -> None:
     text = TABLES.replace("[0, 60, 150, 250]", "[0, 90, 180, 270]")
     (flight / "flight.toml").write_text(text, encoding="utf-8")
@@ -250,6 +275,19 @@ def test_a_field_toml_is_not_written_over_itself(tmp_path: Path) -> None:
     assert "field.toml: describes the field and would be overwritten; write to" in result.stderr
     assert path.read_bytes() == content
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_field_toml_with_measured_lengths_is_not_replaced(tmp_path: Path) -> None:
+    arguments = ["target", "--field", "grid:9x6:25mm:14mm", "--format", "svg", "--out"]
+    for _ in range(2):
+        assert CliRunner().invoke(main, [*arguments, str(tmp_path)]).exit_code == 0
+    path = tmp_path / "field.toml"
+    measured = path.read_text(encoding="utf-8").replace("pitch_m = 0.025", "pitch_m = 0.02503")
+    path.write_text(measured, encoding="utf-8")
+    result = CliRunner().invoke(main, [*arguments, str(tmp_path)], catch_exceptions=False)
+    assert result.exit_code == 1
+    assert "field.toml: describes another field, or this one with measured len" in result.stderr
+    assert path.read_text(encoding="utf-8") == measured
 
 
 def test_a_board_without_a_unit_is_drawn_with_the_one_given(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from kgcp.io.flight.camera_table import (
     read_camera,
     read_plumb_sd_deg,
 )
-from kgcp.io.flight.target_table import read_plain_targets, read_targets
+from kgcp.io.flight.target_table import TARGETS_TOML, read_plain_targets, read_targets
 from kgcp.io.flight.toml_file import read_toml
 from kgcp.io.flight.toml_table import TomlTable
 from kgcp.io.flight.vehicle_table import VehicleTable, read_vehicle
@@ -186,6 +186,42 @@ def read_target_tables(path: Path) -> tuple[Target, ...]:
         As `read_flight`, for what is wrong with the targets.
     """
     return read_targets(read_toml(path, FLIGHT_KEYS, "the targets")[0], path.parent)
+
+
+def refuse_to_lose_targets(
+    targets: Sequence[Target], known: Sequence[Target], folder: Path
+) -> None:
+    """Refuse to write targets over a targets.toml that has others, which may have been printed.
+
+    Parameters
+    ----------
+    targets : sequence of Target
+        Those to be written.
+    known : sequence of Target
+        Those of the flight.toml, which has them in any case.
+    folder : Path
+        That of the targets.toml.
+
+    Raises
+    ------
+    KgcpError
+        Naming the file and the targets; also if the file cannot be read.
+    """
+    path = folder / TARGETS_TOML
+    if not is_file(path):
+        return
+    kept = {target.name for target in known}
+    lost = [
+        target.name
+        for target in read_target_tables(path)
+        if target.name not in kept and target not in targets
+    ]
+    if lost:
+        raise KgcpError(
+            f"{path}: has {', '.join(lost)} of an earlier run, whose codes and lengths would be"
+            " lost; write to another folder, or delete the file if these are not printed",
+            option="out",
+        )
 
 
 def read_camera_and_targets(

@@ -12,6 +12,7 @@ from kgcp.io.files.csv_sniff import sniff_table
 from kgcp.io.files.safe_read import is_file, is_folder, is_number
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.flight.camera_table import read_camera_file
+from kgcp.io.flight.target_table import TARGETS_TOML
 from kgcp.io.formats.calibrations import FORMATS as CALIBRATION_FORMATS
 from kgcp.io.formats.frame_times import looks_like_marks
 from kgcp.io.formats.orientations import FORMATS as POSE_FORMATS
@@ -24,8 +25,6 @@ from kgcp.io.formats.waypoint_export import looks_like_waypoint
 from kgcp.io.images.frames import FRAME_SUFFIXES, RESULTS_NAME, list_frames
 
 FLIGHT_TOML = "flight.toml"
-TARGETS_TOML = "targets.toml"
-"""What `kgcp target` writes beside the sheets."""
 
 _TABLE_SUFFIXES = frozenset({".csv", ".txt", ".pos", ".out", ".sbet", ".tum", ".dat", ".asc"})
 _DATA_SUFFIXES = _TABLE_SUFFIXES | {

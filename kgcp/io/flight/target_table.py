@@ -15,6 +15,9 @@ from kgcp.targets.layout import Ring, Target
 from kgcp.targets.plain import PlainPolarity, PlainTarget, Shape
 from kgcp.targets.validation import check_targets
 
+TARGETS_TOML = "targets.toml"
+"""What `kgcp target` writes beside the sheets."""
+
 _DIAMETERS = ("outer_diameter_m", "inner_diameter_m", "code_diameter_m", "dot_diameter_m")
 PLATE_KEYS = (
     *("name", "shape", *_DIAMETERS, "code_deg", "sd_outer_diameter_m"),
@@ -211,7 +214,7 @@ def write_target_tables(targets: Sequence[Target], folder: Path) -> Path:
     KgcpError
         If it cannot be written.
     """
-    path = folder / "targets.toml"
+    path = folder / TARGETS_TOML
     lines = [line for target in targets for line in target_lines(target)]
     write_bytes(path, ("\n".join(lines).lstrip() + "\n").encode())
     return path
