@@ -219,7 +219,8 @@ def test_motion_without_a_rolling_shutter_or_out_of_range_is_refused(
     ("options", "words", "code"),
     [
         (["--no-survey-errors"], "--no-survey-errors concerns flights; leave it out", 2),
-        (["--shadow", "0.5"], "simulated without shadows", 1),
+        (["--shadow", "0.5"], "without shadows; leave out the option that adds this\n", 1),
+        (["--preset", "shadow"], "'shadow' has shadows, which photographs of a field cannot", 1),
         (["--rolling", "0.02"], "simulated without a rolling shutter", 1),
         (["--motion", "30", "-40"], "simulated without motion of the image", 1),
     ],

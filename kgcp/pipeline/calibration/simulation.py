@@ -60,21 +60,18 @@ class FieldSimulation:
     seed: int
 
     def __post_init__(self) -> None:
-        settings = self.settings
-        unsupported = {
-            "shadows": settings.shadow is not None,
-            "dirt": settings.dirt is not None,
-            "glare": settings.glare is not None,
-            "a rolling shutter": settings.camera.readout_s != 0.0,
-            "motion of the image": settings.motion != preset(settings.name).motion,
-        }
-        for name, is_wanted in unsupported.items():
-            if is_wanted:
+        name, of_preset = self.settings.name, _effects_of_flights(preset(self.settings.name))
+        for effect in _effects_of_flights(self.settings):
+            if effect in of_preset:
                 raise KgcpError(
-                    f"{settings.name}: photographs of a field are simulated without {name}; leave"
-                    " it out, or take another preset",
+                    f"the preset {name!r} has {effect}, which photographs of a field cannot have;"
+                    " take another",
                     option="preset",
                 )
+            raise KgcpError(
+                f"photographs of a field are simulated without {effect}; leave out the option that"
+                " adds this"
+            )
 
     @property
     def photos(self) -> tuple[str, ...]:
@@ -119,6 +116,18 @@ class FieldSimulation:
 
 
 @single_threaded()
+def _effects_of_flights(settings: SimulationSettings) -> list[str]:
+    """Return the effects among the settings that photographs of a field cannot have."""
+    is_wanted = {
+        "shadows": settings.shadow is not None,
+        "dirt": settings.dirt is not None,
+        "glare": settings.glare is not None,
+        "a rolling shutter": settings.camera.readout_s != 0.0,
+        "motion of the image": settings.motion != preset(settings.name).motion,
+    }
+    return [effect for effect, wanted in is_wanted.items() if wanted]
+
+
 def write_field_photographs(
     simulation: FieldSimulation, out: Path, *, jobs: int, on_photograph: Callable[[], object]
 ) -> None:
