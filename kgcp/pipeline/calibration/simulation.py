@@ -115,7 +115,6 @@ class FieldSimulation:
         return taken.pose
 
 
-@single_threaded()
 def _effects_of_flights(settings: SimulationSettings) -> list[str]:
     """Return the effects among the settings that photographs of a field cannot have."""
     is_wanted = {
@@ -128,6 +127,7 @@ def _effects_of_flights(settings: SimulationSettings) -> list[str]:
     return [effect for effect, wanted in is_wanted.items() if wanted]
 
 
+@single_threaded()
 def write_field_photographs(
     simulation: FieldSimulation, out: Path, *, jobs: int, on_photograph: Callable[[], object]
 ) -> None:
