@@ -115,8 +115,8 @@ def test_names_and_exposures_follow_the_settings() -> None:
 
 
 @pytest.mark.parametrize("name", ["shadow", "dirty", "glare", "rolling"])
-def test_presets_with_uneven_light_are_refused_for_fields(name: str) -> None:
-    with pytest.raises(KgcpError, match="without"):
+def test_presets_of_flights_are_refused_for_fields(name: str) -> None:
+    with pytest.raises(KgcpError, match="has .*, which photographs of a field cannot have"):
         FieldSimulation(FIELD, preset(name), 1)
 
 
