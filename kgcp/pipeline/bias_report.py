@@ -30,6 +30,7 @@ from kgcp.io.tables.detections import (
 from kgcp.io.tables.gcps import BIAS_COLUMNS, bias_row
 from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.provenance import derived_provenance
+from kgcp.io.tables.staleness import are_by_orient
 from kgcp.measurement.image_model.window import contour_px
 from kgcp.pipeline.exclude import FrameAndTarget, without_excluded
 from kgcp.pipeline.execution.signals import defer_interrupts
@@ -251,6 +252,7 @@ def bias_study(
             flight.all_targets,
             settings.method,
             inputs.motions(sightings),
+            _orienting_targets(flight),
         )
     consistency, doubts = inputs.compared(sightings)
     choices = {"excluded": pairs} if pairs else {}
@@ -266,6 +268,13 @@ def bias_study(
         learnt=read_learnt_imaging(table),
         left_out=sum(attempt.sighting is not None for attempt in read) - len(sightings),
     )
+
+
+def _orienting_targets(flight: Flight) -> tuple[str, ...]:
+    """Return the names of the static targets if the reference poses were computed from them."""
+    if flight.reference is None or not are_by_orient(flight.reference.file, flight):
+        return ()
+    return tuple(target.name for target in flight.static_targets)
 
 
 def _closeups_and_reexposures(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -142,6 +142,8 @@ class BiasStudy:
     # frames with several plates of one code, which do not tell which of them is the target
     frames_with_several_plates: tuple[str, ...]
     absences: tuple[NoPosition, ...]  # why the target's position is unknown in some frames
+    # frames with targets that the reference poses were computed from
+    frames_with_orienting_targets: tuple[str, ...] = ()
 
     def trusts(self, pair: Comparison) -> bool:
         """Whether a comparison has a measurement that is not misplaced."""
@@ -163,6 +165,7 @@ def study_bias(
     targets: Sequence[AnyTarget],
     method: Method,
     motions: CameraMotions | None = None,
+    orienting: Collection[str] = (),
 ) -> BiasStudy:
     """Compare every attempt with the reference.
 
@@ -175,6 +178,9 @@ def study_bias(
         Motion of the camera while a rolling shutter reads the frames, in the order of the poses.
         The poses are those of the middle row. None: the camera does not move, or all rows are
         exposed at once.
+    orienting : collection of str
+        Names of targets that the reference poses were computed from. They are left out, since their
+        errors have gone into the poses.
 
     Raises
     ------
@@ -182,6 +188,13 @@ def study_bias(
         If nothing was measured, if no measured frame has a pose, or as
         `TargetPositions.positions`.
     """
+    used = {each.frame for each in attempts if each.target in orienting}
+    attempts = [each for each in attempts if each.target not in orienting]
+    if used and not attempts:
+        raise KgcpError(
+            "the reference poses were computed from all measured targets, by 'kgcp orient', so that"
+            " their distances say nothing of a bias; give [reference] poses of an adjustment"
+        )
     several = {(each.frame, each.target) for each in attempts if _is_second_plate(each)}
     considered = _with_measured_target(
         [attempt for attempt in attempts if (attempt.frame, attempt.target) not in several],
@@ -222,6 +235,7 @@ def study_bias(
         frames_with_vague_reference=vague,
         frames_with_several_plates=tuple(sorted({frame for frame, _ in several})),
         absences=tuple(position for position in positions if isinstance(position, NoPosition)),
+        frames_with_orienting_targets=tuple(sorted(used)),
     )
 
 

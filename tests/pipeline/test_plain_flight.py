@@ -113,10 +113,12 @@ def test_four_discs_can_orient_frames_check_a_vehicle_and_be_placed(folder: Path
     by_targets = text.replace('"reference.csv"', '"kgcp/poses.csv"')
     (folder / "flight.toml").write_text(by_targets, encoding="utf-8")
     try:
-        table = bias_study(read_flight(folder)).to_dataframe()
-        car = table[table["target"] == "car"]
+        bias = bias_study(read_flight(folder))
+        car = bias.to_dataframe()
         assert len(car) == FLIGHT.frames
+        assert set(car["target"]) == {"car"}  # the poses were computed from the others
         assert np.abs(car["residual_m"]).max() < 0.05
+        assert len(bias.study.frames_with_orienting_targets) == FLIGHT.frames
         points = make_gcps(read_flight(folder)).to_dataframe()
         assert len(points) == FLIGHT.frames * (len(FOUR) + 1)
     finally:

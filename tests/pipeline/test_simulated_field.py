@@ -116,7 +116,7 @@ def test_names_and_exposures_follow_the_settings() -> None:
 
 @pytest.mark.parametrize("name", ["shadow", "dirty", "glare", "rolling"])
 def test_presets_of_flights_are_refused_for_fields(name: str) -> None:
-    with pytest.raises(KgcpError, match="has .*, which photographs of a field cannot have"):
+    with pytest.raises(KgcpError, match=r"has .*, which photographs of a field cannot have"):
         FieldSimulation(FIELD, preset(name), 1)
 
 

@@ -195,6 +195,19 @@ def test_frames_with_two_plates_of_one_code_are_not_compared() -> None:
         study_bias([attempts[0], second], poses, _TARGET_POSITIONS, _CAMERA, [_TARGET], _METHOD)
 
 
+def test_targets_that_gave_the_poses_are_not_compared_with_them() -> None:
+    """Their errors have gone into the poses, and would seem smaller than they are."""
+    attempts, poses = _attempts(), _nadir_poses(_ABOVE)
+    static = replace(attempts[1], target="static")
+    measured = [attempts[0], static, *attempts[2:]]
+    places, targets = (_TARGET_POSITIONS, _CAMERA, [_TARGET], _METHOD), ("static",)
+    study = study_bias(measured, poses, *places, orienting=targets)
+    assert [pair.attempt.frame for pair in study.measured] == [_frame(0), _frame(2), _frame(3)]
+    assert dict(bias_numbers(study).left_out)["static_targets_that_gave_the_poses"] == 1
+    with pytest.raises(KgcpError, match="computed from all measured targets, by 'kgcp orient'"):
+        study_bias([static], poses, *places, orienting=targets)
+
+
 def test_nothing_to_compare_is_an_error_with_a_remedy() -> None:
     poses = _nadir_poses(_ABOVE)
     with pytest.raises(KgcpError, match="no target was measured"):

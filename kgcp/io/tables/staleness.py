@@ -112,27 +112,43 @@ def require_current(path: Path, table: pd.DataFrame, flight: Flight) -> None:
 def changed_since_orient(poses: Path, flight: Flight) -> list[str]:
     """Return what has changed in flight.toml since `kgcp orient` wrote reference poses.
 
-    Poses that another program wrote depend on nothing in flight.toml. Those of `kgcp orient` are
-    recognised by the table beside them, or in the flight's results, which states their digest.
+    Poses that another program wrote depend on nothing in flight.toml.
 
     Parameters
     ----------
     poses : Path
         File of the reference poses.
     """
+    metadata = _orientation_metadata(poses, flight)
+    if metadata is None:
+        return []
+    then = _json(metadata, b"kgcp.orientation_inputs")
+    return [*_changed_keys(then, orientation_inputs(flight))]
+
+
+def are_by_orient(poses: Path, flight: Flight) -> bool:
+    """Tell whether `kgcp orient` computed reference poses, from the flight's static targets."""
+    return _orientation_metadata(poses, flight) is not None
+
+
+def _orientation_metadata(poses: Path, flight: Flight) -> Mapping[bytes, bytes] | None:
+    """Return the metadata of the table that `kgcp orient` wrote with reference poses.
+
+    The table lies beside them, or in the flight's results, and states their digest. None: the poses
+    are by another program.
+    """
     try:
         found = content_digest(poses.read_bytes()).encode()
     except OSError:  # reported where the poses are read
-        return []
+        return None
     for folder in (poses.parent, flight.folder / RESULTS_NAME):
         try:
             metadata = pq.read_schema(folder / POSES_TABLE).metadata or {}
         except (OSError, pa.ArrowException):  # no table, or a damaged one
             continue
         if metadata.get(b"kgcp.poses_csv") == found:
-            then = _json(metadata, b"kgcp.orientation_inputs")
-            return [*_changed_keys(then, orientation_inputs(flight))]
-    return []
+            return metadata
+    return None
 
 
 def listed_changes(changes: Sequence[str]) -> str:

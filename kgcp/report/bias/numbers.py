@@ -213,6 +213,8 @@ def bias_numbers(study: BiasStudy) -> BiasNumbers:
         left_out["vague_reference"] = len(study.frames_with_vague_reference)
     if study.frames_with_several_plates:
         left_out["second_plate"] = len(study.frames_with_several_plates)
+    if study.frames_with_orienting_targets:
+        left_out["static_targets_that_gave_the_poses"] = len(study.frames_with_orienting_targets)
     return BiasNumbers(
         compared=tuple(compared),
         data=data,
