@@ -89,11 +89,12 @@ _MOST_CLIPPED_FOR_EDGE_TONE = 0.02
 # the median, z 2.0), and by single pixels 5 ppm (0.7).
 _SHARP_IN_BINS = 0.65
 # White whose noise does not tell whether it is burnt may be so from this share of the range on. It
-# is if even light with clipped white explains the image, with a log-likelihood that is greater by
-# so much than with the white that is seen. Of 72 rings of simulated phones (R 20 to 76 px) that are
-# burnt, 71 gain 57 or more over one of the bases, and white has 0.93 to 0.98. Of 198 that are not
-# burnt, eight were taken for burnt with these limits, and 42 without that of white. Errors of their
-# sets grew by up to a fifth by these 42, since pixels near white are then left out.
+# is if even light explains the image with clipped white, with a log-likelihood that is greater by
+# so much than with the white that is seen. Of 72 burnt rings of simulated phones (R 20 to 76 px)
+# that even light explains then, 71 gain 57 or more over one of the bases; their white is at 0.93 to
+# 0.98 of the range. Of 198 rings that are not burnt, eight were taken for burnt with these limits.
+# Without that of white it would be 42, and errors of some sets grew by up to a third, since pixels
+# near white are then left out.
 _LEAST_BURNT, _LEAST_ADVANTAGE_OF_BURNT = 0.92, 40.0
 _MOST_BURNT = 3.0  # largest start value of a burnt white, relative to the clipped one that is seen
 

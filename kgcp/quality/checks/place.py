@@ -93,7 +93,8 @@ def check_export_crs(crs: str, position_map: FloatArray) -> Iterator[Doubt]:
     if not np.isfinite(place).all():
         return
     remedy = f"name a CRS of this region, for example --crs {utm_crs(*place.tolist())}"
-    area, outside = area_of_use(crs), _outside(area_of_use(crs), crs, xy)
+    area = area_of_use(crs)
+    outside = _outside(area, crs, xy)
     if area is None or outside <= _MAX_OUTSIDE_DEG:
         yield from _doubts_of_scale(crs, place, remedy)
         return
