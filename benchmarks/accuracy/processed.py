@@ -4,11 +4,15 @@ Usage: python -m benchmarks.accuracy.processed FLIGHT... [--only median] [--jobs
 
 Each kind of processing is applied to the frames of a flight, and their response is then declared
 unknown. The lines are those of `benchmarks.accuracy.flights`. They show whether the reported
-standard deviations remain right, and whether targets that cannot be measured are rejected.
+standard deviations remain right, and whether targets that cannot be measured are rejected. Video
+needs PyAV (`pip install av`), and is left out without it.
 """
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
+import io
 import re
 import shutil
 import tempfile
@@ -32,6 +36,10 @@ Pixels = npt.NDArray[np.uint8]  # (rows, columns) or (rows, columns, 3)
 _COMPRESSIONS = {"JPEG 70": 70, "JPEG 40": 40}  # name → quality
 _QUALITY = 95  # of the JPEGs of other processings
 _STUCK_SHARE, _SEED = 0.001, 3  # share of stuck pixels
+_VIDEO_RATE_FACTOR = "18"  # of x264; 23 is its default, and gives half the size
+_VIDEO_FRAMES = 13  # half a second; one of them is taken for the flight
+_MOTION_PX = np.array([3.37, -1.81])  # of the image between two frames of a video
+_VIDEO_NOISE = 1.5  # standard deviation [grey values], new in every frame
 
 
 def _rounded(values: npt.NDArray[np.floating]) -> Pixels:
@@ -89,6 +97,45 @@ def _interlaced(pixels: Pixels) -> Pixels:
     return changed
 
 
+def _moved(pixels: Pixels, frames: int, rng: np.random.Generator) -> Pixels:
+    """Return what a video shows some frames later, while its camera moves evenly."""
+    height, width = pixels.shape[:2]
+    shift = np.column_stack([np.eye(2), frames * _MOTION_PX])
+    moved = cv2.warpAffine(
+        pixels, shift, (width, height), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
+    )
+    return _rounded(moved + rng.normal(0.0, _VIDEO_NOISE, moved.shape))
+
+
+def _from_video(pixels: Pixels, number: int) -> Pixels:
+    """Return the frame as H.264 keeps it as a video's frame of a number from 0 upwards.
+
+    Frame 0 is a key frame, compressed on its own. The blocks of the others are copied from frames
+    before them with a displacement, and only larger differences are stored.
+    """
+    av = importlib.import_module("av")
+    height, width = pixels.shape[:2]
+    rng = np.random.default_rng(_SEED)
+    file = io.BytesIO()
+    with av.open(file, "w", format="mp4") as video:
+        stream = video.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.options = {"crf": _VIDEO_RATE_FACTOR}
+        for shown in range(_VIDEO_FRAMES):
+            grey = pixels if shown == number else _moved(pixels, shown - number, rng)
+            colours = grey if grey.ndim == 3 else cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+            video.mux(stream.encode(av.VideoFrame.from_ndarray(colours, format="bgr24")))
+        video.mux(stream.encode())
+    file.seek(0)
+    with av.open(file) as video:
+        decoded = list(video.decode(video=0))[number].to_ndarray(format="bgr24")
+    return np.asarray(decoded if pixels.ndim == 3 else decoded[..., 1], np.uint8)
+
+
+_VIDEOS: Mapping[str, Callable[[Pixels], Pixels]] = {
+    "key frames": lambda pixels: _from_video(pixels, 0),
+    "video frames": lambda pixels: _from_video(pixels, _VIDEO_FRAMES - 1),
+}
 PROCESSINGS: Mapping[str, Callable[[Pixels], Pixels]] = {
     "as it is": lambda pixels: pixels,
     "hot pixels": lambda pixels: _with_stuck_pixels(pixels, 255),
@@ -106,10 +153,11 @@ PROCESSINGS: Mapping[str, Callable[[Pixels], Pixels]] = {
     "CLAHE": _contrast_by_tiles,
     **dict.fromkeys(_COMPRESSIONS, lambda pixels: pixels),
     "interlaced": _interlaced,
+    **(_VIDEOS if importlib.util.find_spec("av") else {}),
 }
 """Functions of the pixels of a frame, by the name of the processing.
 
-Compression takes place when the frame is written."""
+JPEG compression takes place when the frame is written."""
 
 
 def process_flight(flight: Path, name: str, out: Path) -> None:

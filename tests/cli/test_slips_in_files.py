@@ -148,7 +148,7 @@ def test_a_folder_in_place_of_a_calibration_file_is_named(unmeasured: SampleFlig
     ("suffix", "words"),
     [
         (".DNG", "5 .dng raw files; develop them to JPEG, PNG or TIFF without lens correction"),
-        (".MP4", "5 .mp4 videos; extract the frames with the time of each"),
+        (".MP4", "5 .mp4 videos; extract the key frames with the time of each"),
         (".heic", "5 .heic files of a phone; convert them to JPEG or PNG of the same size"),
         (".pdf", "5 .pdf files; convert them to JPEG, PNG or TIFF, or correct [frames] folder"),
     ],

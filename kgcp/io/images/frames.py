@@ -202,8 +202,8 @@ def kind_of(suffix: str) -> tuple[str, str]:
         )
     if suffix in _VIDEO_SUFFIXES:
         return "videos", (
-            "extract the frames with the time of each ('ffmpeg -i FILE frames/%05d.png'), and give"
-            " the times in frames.csv"
+            "extract the key frames with the time of each ('ffmpeg -skip_frame nokey -i FILE"
+            " -fps_mode passthrough frames/%05d.png'), and give the times in frames.csv"
         )
     if suffix in _PHONE_SUFFIXES:
         return "files of a phone", "convert them to JPEG or PNG of the same size"
