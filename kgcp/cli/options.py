@@ -220,7 +220,8 @@ _SELECTION = (
         metavar="SHARE",
         type=NumberRange(0.0, 1.0),
         default=0.0,
-        help="Make this share of the points check points, spaced evenly along the track.",
+        help="Make this share of the moving points check points, spaced evenly along the track; 1"
+        " makes all of them check points.",
     ),
     click.option(
         "--keep-flagged",

@@ -299,8 +299,12 @@ def set_checkpoints(gcps: Sequence[Gcp], local_frame: LocalFrame, share: float) 
 
     The track is cut into as many equal pieces, and the point nearest to the middle of each becomes
     a check point. The first and the last point stay control points, because nothing beyond them
-    would control the ends. A share above zero makes at least one of the others a check point.
+    would control the ends. A share above zero makes at least one of the others a check point. A
+    share of 1 makes all of them check points, also at the ends: they check a block that is
+    controlled otherwise, and two controls would flatter it.
     """
+    if share == 1.0:
+        return tuple(replace(point, is_checkpoint=_moves(point)) for point in gcps)
     along = distances_along_track_m(gcps, local_frame)
     inner = sorted(along, key=along.__getitem__)[1:-1]
     count = min(max(round(share * len(along)), 1), len(inner))

@@ -145,7 +145,7 @@ def test_a_second_pass_of_the_same_road_is_not_thinned_away() -> None:
 
 @pytest.mark.parametrize(
     ("count", "share", "expected"),
-    [(20, 0.25, 5), (20, 0.0, 0), (20, 0.01, 1), (3, 1.0, 1), (2, 0.5, 0)],
+    [(20, 0.25, 5), (20, 0.0, 0), (20, 0.01, 1), (3, 0.99, 1), (2, 0.5, 0)],
 )
 def test_checkpoints_are_spread_evenly_and_never_at_the_ends(
     count: int, share: float, expected: int
@@ -161,6 +161,12 @@ def test_checkpoints_are_spread_evenly_and_never_at_the_ends(
     assert [p.is_checkpoint for p in set_checkpoints(_line(count), _LOCAL_FRAME, share)] == [
         p.is_checkpoint for p in points
     ]
+
+
+def test_a_share_of_one_leaves_no_moving_point_to_control_a_block() -> None:
+    static = replace(_point(9, 0.0), id="G", common_m=None)
+    points = set_checkpoints((*_line(5), static), _LOCAL_FRAME, 1.0)
+    assert [point.is_checkpoint for point in points] == [True] * 5 + [False]
 
 
 def test_static_targets_are_neither_thinned_nor_checked() -> None:

@@ -48,6 +48,7 @@ _WRITERS: Mapping[str, ModuleType] = {
 
 
 _AS_MEASURED = {"csv", "geojson", "geopackage"}  # for people, not for adjustments: no floors
+_OF_CONTROLS = {"odm", "opensfm", "micmac", "mmvii"}  # no check points; no adjustment without any
 
 
 def export(points: MapPoints, name: str, folder: Path) -> list[Path]:
@@ -62,6 +63,11 @@ def export(points: MapPoints, name: str, folder: Path) -> list[Path]:
     """
     if not points.gcps:
         raise KgcpError(f"{name}: no points left after selection; relax the limits")
+    if name in _OF_CONTROLS and not points.controls:
+        raise KgcpError(
+            f"{name}: all points are check points, which this format cannot hold; keep some of"
+            " them as control points, or use another format"
+        )
     if name not in _AS_MEASURED:
         points = replace(points, gcps=with_floors(points.gcps, points.mark_floor_px))
     files: Mapping[str, str | bytes] = _WRITERS[name].files(points)

@@ -55,6 +55,21 @@ def test_no_points_are_an_error(make_points: Factory, tmp_path: Path, name: str)
     assert not [*tmp_path.iterdir()]
 
 
+def test_check_points_alone_are_refused_where_only_controls_are_written(
+    points: MapPoints, tmp_path: Path
+) -> None:
+    """An adjustment of an empty list fails, or runs without any control."""
+    checks = replace(
+        points, gcps=tuple(replace(point, is_checkpoint=True) for point in points.gcps)
+    )
+    for name in FORMATS:
+        if name in {"odm", "opensfm", "micmac", "mmvii"}:
+            with pytest.raises(KgcpError, match=f"{name}: all points are check points"):
+                export(checks, name, tmp_path)
+        else:
+            assert export(checks, name, tmp_path)
+
+
 def test_how_tos_say_what_is_ignored(points: MapPoints, tmp_path: Path) -> None:
     for name in set(FORMATS) - {"csv", "geojson", "geopackage", "camera-priors"}:
         (how_to,) = [p for p in export(points, name, tmp_path) if p.name == "HOWTO.txt"]
