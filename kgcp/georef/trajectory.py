@@ -59,6 +59,7 @@ class Trajectory:
     # (n, 3, 3): covariances along the map's axes [m²], whose diagonals are the squares of
     # `sd_position_m`; None: the file has standard deviations at most
     cov_position_m2: FloatArray | None = None
+    format: str = ""  # of its file, as [vehicle] format names it; "": it is from no file
 
 
 class Coverage(StrEnum):

@@ -262,7 +262,7 @@ class FlightInputs:
                 doubts += check_steady_offsets(self.course, vehicle.settings)
                 doubts += check_flips(vehicle.motion, headings_deg, vehicle.settings)
                 doubts += check_spikes(vehicle.motion)
-                doubts += check_deviations(vehicle.motion)
+                doubts += check_deviations(vehicle.motion, self.trajectory.format)
             if self.reference_poses is not None:
                 doubts += check_reference(self.reference_poses, self.target_positions)
         poses = self.reference_poses

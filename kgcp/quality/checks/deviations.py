@@ -28,19 +28,31 @@ _SD_OF_MEDIAN = 1.4826  # of a normal distribution over the median of absolute d
 _REMEDY = (
     "give those of the receiver's software, or remove their columns from the trajectory's file"
 )
+_MISSING_REMEDIES = {  # by the format of the trajectory's file, with the columns of a CSV file
+    "csv": "export the trajectory with them, as {columns}",
+    "sbet": "name the file that has them, POSPac's smrmsg, as [vehicle] accuracies",
+    "tum": "its format has none: give the trajectory as a CSV file with {columns}",
+}
 _POSES_REMEDY = "give those of the adjustment, or remove their columns from the poses' file"
 
 
-def check_deviations(motion: Motion) -> Iterator[Doubt]:
+def check_deviations(motion: Motion, form: str) -> Iterator[Doubt]:
     """Yield doubts about standard deviations of a trajectory.
 
     They may be missing, 0, in millimetres or variances, or smaller than the positions' scatter.
+
+    Parameters
+    ----------
+    form : str
+        Format of the trajectory's file, which decides how missing ones can be given.
     """
     sd_m = motion.sd_position_m
     if sd_m is None:
-        yield _missing("positions", "points will have none")
+        effect = "points will have none"
+        yield _missing("positions", effect, form, "sd_x, sd_y, sd_z")
     elif motion.sd_attitude_deg is None:
-        yield _missing("attitudes", "the lever arm's direction counts as exact")
+        effect = "the lever arm's direction counts as exact"
+        yield _missing("attitudes", effect, form, "sd_roll_deg, sd_pitch_deg, sd_heading_deg")
     if sd_m is not None:
         effect = "points there are weighted far too much"
         is_zero = np.any(sd_m == 0.0, axis=1)
@@ -59,12 +71,12 @@ def check_deviations(motion: Motion) -> Iterator[Doubt]:
         yield from _zeros(is_zero, "trajectory's attitudes", "epochs", effect, _REMEDY)
 
 
-def _missing(of: str, effect: str) -> Doubt:
+def _missing(of: str, effect: str, form: str, columns: str) -> Doubt:
+    remedy = _MISSING_REMEDIES.get(form, "export the trajectory with them")
     return mild(
         Cause.STANDARD_DEVIATIONS,
         f"the trajectory has no standard deviations of its {of}: {effect}",
-        "export the trajectory with them; those of an SBET are in a file of their own, which"
-        " [vehicle] accuracies names",
+        remedy.format(columns=columns),
         {},
     )
 

@@ -24,37 +24,57 @@ _POSES = ReferencePoses(tuple("abcde"), np.zeros((5, 3)), np.zeros((5, 3)), _SD,
 
 
 def test_deviations_that_are_missing_are_doubted() -> None:
-    (position,) = check_deviations(replace(_MOTION, sd_position_m=None, sd_attitude_deg=None))
-    (attitude,) = check_deviations(replace(_MOTION, sd_attitude_deg=None))
+    (position,) = check_deviations(
+        replace(_MOTION, sd_position_m=None, sd_attitude_deg=None), "csv"
+    )
+    (attitude,) = check_deviations(replace(_MOTION, sd_attitude_deg=None), "csv")
     assert (position.code, position.is_grave) == (Cause.STANDARD_DEVIATIONS, False)
     assert position.sentence.endswith("of its positions: points will have none")
     assert attitude.sentence.endswith("of its attitudes: the lever arm's direction counts as exact")
 
 
+@pytest.mark.parametrize(
+    ("form", "of_positions", "of_attitudes"),
+    [
+        ("csv", "them, as sd_x, sd_y, sd_z", "them, as sd_roll_deg, sd_pitch_deg, sd_heading_deg"),
+        ("sbet", "[vehicle] accuracies", "[vehicle] accuracies"),
+        ("tum", "a CSV file with sd_x, sd_y, sd_z", "sd_roll_deg, sd_pitch_deg, sd_heading_deg"),
+        ("waypoint", "export the trajectory with them", "export the trajectory with them"),
+    ],
+)
+def test_the_remedy_for_missing_deviations_is_that_of_the_format(
+    form: str, of_positions: str, of_attitudes: str
+) -> None:
+    (position,) = check_deviations(replace(_MOTION, sd_position_m=None), form)
+    (attitude,) = check_deviations(replace(_MOTION, sd_attitude_deg=None), form)
+    assert position.remedy.endswith(of_positions)
+    assert attitude.remedy.endswith(of_attitudes)
+
+
 def test_deviations_that_are_known_raise_no_doubt() -> None:
-    assert not [*check_deviations(_MOTION)]
+    assert not [*check_deviations(_MOTION, "csv")]
     level = _SD * [0.0, 0.0, 1.0]  # a flat yard, and heading by two antennas
-    assert not [*check_deviations(replace(_MOTION, sd_attitude_deg=level))]
+    assert not [*check_deviations(replace(_MOTION, sd_attitude_deg=level), "csv")]
 
 
 def test_deviations_of_zero_are_doubted() -> None:
     position, attitude = check_deviations(
-        replace(_MOTION, sd_position_m=0.0 * _SD, sd_attitude_deg=0.0 * _SD)
+        replace(_MOTION, sd_position_m=0.0 * _SD, sd_attitude_deg=0.0 * _SD), "csv"
     )
     assert (position.code, position.is_grave) == (Cause.STANDARD_DEVIATIONS, False)
     assert "positions are 0 for all epochs" in position.sentence
     assert "attitudes are 0 for all epochs" in attitude.sentence
-    (heights,) = check_deviations(replace(_MOTION, sd_position_m=_SD * [1.0, 1.0, 0.0]))
+    (heights,) = check_deviations(replace(_MOTION, sd_position_m=_SD * [1.0, 1.0, 0.0]), "csv")
     assert "positions are 0 for all epochs" in heights.sentence
 
 
 def test_epochs_with_deviations_of_zero_are_counted() -> None:
     sd = _SD.copy()
     sd[2:4] = 0.0
-    (doubt,) = check_deviations(replace(_MOTION, sd_position_m=sd))
+    (doubt,) = check_deviations(replace(_MOTION, sd_position_m=sd), "csv")
     assert "are 0 for 2 of 5 epochs" in doubt.sentence
     assert doubt.figures == {"epochs": 2.0}
-    (of_attitude,) = check_deviations(replace(_MOTION, sd_attitude_deg=sd))
+    (of_attitude,) = check_deviations(replace(_MOTION, sd_attitude_deg=sd), "csv")
     assert "attitudes are 0 for 2 of 5 epochs" in of_attitude.sentence
 
 
@@ -79,7 +99,7 @@ def test_reference_poses_with_deviations_of_zero_are_doubted() -> None:
     ],
 )
 def test_deviations_of_another_unit_are_doubted(factors: FloatArray, words: str) -> None:
-    (doubt,) = check_deviations(replace(_MOTION, sd_position_m=_SD * factors))
+    (doubt,) = check_deviations(replace(_MOTION, sd_position_m=_SD * factors), "csv")
     assert words in doubt.sentence
     assert (doubt.code, doubt.is_grave) == (Cause.STANDARD_DEVIATIONS, False)
 
@@ -98,20 +118,20 @@ def _driven(rate_hz: float) -> Motion:
 @pytest.mark.parametrize("rate_hz", [1.0, 5.0, 20.0, 100.0])
 def test_positions_that_scatter_by_less_than_is_stated_raise_no_doubt(rate_hz: float) -> None:
     driven = _driven(rate_hz)
-    assert not [*check_deviations(driven)]
+    assert not [*check_deviations(driven, "csv")]
     gap = replace(driven, time_s=driven.time_s + (driven.time_s > 20.0) * 100.0)
-    assert not [*check_deviations(gap)]
+    assert not [*check_deviations(gap, "csv")]
 
 
 @pytest.mark.parametrize("rate_hz", [5.0, 20.0, 100.0])
 def test_positions_that_scatter_by_more_than_is_stated_are_doubted(rate_hz: float) -> None:
     driven = _driven(rate_hz)
     noise = np.random.default_rng(3).normal(0.0, 0.1, driven.position_m.shape)
-    (noisy,) = check_deviations(replace(driven, position_m=driven.position_m + noise))
+    (noisy,) = check_deviations(replace(driven, position_m=driven.position_m + noise), "csv")
     assert (noisy.code, noisy.is_grave) == (Cause.STANDARD_DEVIATIONS, False)
     assert noisy.figures["scatter_m"] == pytest.approx(np.sqrt(3.0) * 0.1, rel=0.15)
     assert noisy.figures["sd_m"] == pytest.approx(np.sqrt(3.0) * 0.02)
-    (coarse,) = check_deviations(replace(driven, position_m=np.round(driven.position_m)))
+    (coarse,) = check_deviations(replace(driven, position_m=np.round(driven.position_m)), "csv")
     assert coarse.remedy.startswith("export the trajectory again with all digits")
 
 

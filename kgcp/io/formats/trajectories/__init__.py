@@ -84,6 +84,7 @@ def read_trajectory(
         epochs.sd_position_m,
         sd_attitude_deg,
         epochs.cov_position_m2,
+        form,
     )
 
 

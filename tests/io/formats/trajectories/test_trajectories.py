@@ -316,6 +316,7 @@ def test_formats_give_the_same_result_whether_recognised_or_named(
     path.write_bytes(content)
     for stated in (options, replace(options, format=kind)):
         trajectory = read_trajectory(path, _CRS, stated)
+        assert trajectory.format == kind
         np.testing.assert_allclose(trajectory.time_s, 1777887000.0 + np.array([0.0, 0.5]))
         arc_m = 0.9996 * 4984944.378  # to 45 degrees, on the zone's meridian
         np.testing.assert_allclose(trajectory.position_map[0], [5e5, arc_m, 100.0], atol=1e-3)
