@@ -228,6 +228,8 @@ def _report(results: CalibrationResults) -> None:
         err=True,
     )
     click.echo(results.verdict.sentence, err=True)
+    if results.comparison is not None:
+        click.echo(results.comparison.sentence, err=True)
     for sentence in results.verdict.advice:
         click.echo(f"advice: {sentence}", err=True)
     for path in results.files:

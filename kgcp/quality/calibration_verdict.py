@@ -79,6 +79,11 @@ class CalibrationNumbers:
     light: DiscLight | None  # None: levels are not known
 
     @property
+    def mean_ray_sd_px(self) -> float:
+        """Standard deviation of a pixel's ray over the frame: the root mean square [px]."""
+        return float(np.sqrt(np.nanmean(self.ray_sd_px**2)))
+
+    @property
     def photographs(self) -> str:
         """The number of photographs, and that of places if there are fewer, in words."""
         if self.places == self.views:

@@ -305,7 +305,8 @@ def test_another_calibration_is_compared_with(
     field = photos / "field.toml"
     camera = read_camera_file(own).camera
     longer = tmp_path / "longer.yml"
-    calibrated = CalibratedCamera(replace(camera, fx=1.01 * camera.fx), np.eye(12), 0.0)
+    zoomed = replace(camera, fx=1.01 * camera.fx, fy=1.01 * camera.fy)
+    calibrated = CalibratedCamera(zoomed, np.eye(12), 0.0)
     longer.write_text(camera_file(calibrated, "opencv")[1])
     out = tmp_path / "out"
     result = run(
@@ -316,7 +317,10 @@ def test_another_calibration_is_compared_with(
     assert told["file"] == "longer.yml"
     assert told["change"]["fx"] == pytest.approx(-3.9, abs=1.5)
     assert 0.3 < told["rms_px"] < told["largest_px"] < 4.0
-    assert "Against longer.yml" in (out / "calibration.html").read_text(encoding="utf-8")
+    assert re.match(r"Its focal length is (0\.9|1)\d* % longer, as with", told["convention"])
+    page = (out / "calibration.html").read_text(encoding="utf-8")
+    assert "Against longer.yml" in page
+    assert told["convention"] in page
     wide = tmp_path / "wide.toml"
     wide.write_text(own.read_text().replace("width = 400", "width = 401"))
     options = ("--same-aspect", *FASTEST, "--against", wide)

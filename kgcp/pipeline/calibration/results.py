@@ -44,6 +44,7 @@ from kgcp.quality.calibration_verdict import (
     change_if_neglected,
     judge,
 )
+from kgcp.quality.camera_conventions import convention_words
 from kgcp.quality.disc_light import DiscLight, light_on_discs
 from kgcp.quality.frame_rays import compare_cameras
 from kgcp.report.calibration.figures import draw_comparison, draw_figures
@@ -66,6 +67,7 @@ class CalibrationResults:
     verdict: CalibrationVerdict
     photos: tuple[PhotoRow, ...]
     summary: dict[str, object]  # calibration.json
+    comparison: CameraComparison | None = None
 
 
 def require_formats(formats: Sequence[str], settings: CalibrationSettings) -> None:
@@ -123,7 +125,10 @@ def write_results(
     comparison = None
     if other is not None:
         difference = compare_cameras(calibration.camera, other.camera)
-        comparison = CameraComparison(other.name, other.camera, difference)
+        words = convention_words(
+            calibration.camera, other.camera, numbers.sd, numbers.mean_ray_sd_px
+        )
+        comparison = CameraComparison(other.name, other.camera, difference, words)
     exported = CalibratedCamera(calibration.camera, calibration.covariance.cov, numbers.rms_px)
     left_out = _left_out(calibration.camera, formats)
     texts = dict(camera_file(exported, form) for form in formats if form not in left_out)
@@ -154,7 +159,14 @@ def write_results(
     write_all({out / name: text.encode() for name, text in texts.items()})
     files = tuple(out / name for name in names)
     return CalibrationResults(
-        files, left_out, not_renewed(out, files), numbers, verdict, tuple(photos), summary
+        files,
+        left_out,
+        not_renewed(out, files),
+        numbers,
+        verdict,
+        tuple(photos),
+        summary,
+        comparison,
     )
 
 

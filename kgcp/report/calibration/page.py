@@ -33,6 +33,13 @@ class CameraComparison:
     name: str
     camera: Camera
     difference: CameraDifference
+    convention: str  # from `convention_words`
+
+    @property
+    def sentence(self) -> str:
+        """The difference, and what explains it if one convention does."""
+        sizes = f"{self.difference.rms_px:.3f} px (RMS; at most {self.difference.largest_px:.3f} px"
+        return f"{self.name}: images of rays differ by {sizes}). {self.convention}".rstrip()
 
     def numbers(self, camera: Camera) -> dict[str, object]:
         """Return the entry of calibration.json; changes are `camera` minus the other camera."""
@@ -41,7 +48,7 @@ class CameraComparison:
             for name in CALIBRATION_PARAMETERS
         }
         sizes = {"rms_px": self.difference.rms_px, "largest_px": self.difference.largest_px}
-        return {"file": self.name, **sizes, "change": changes}
+        return {"file": self.name, **sizes, "change": changes, "convention": self.convention}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,7 +88,7 @@ def render_calibration(page: CalibrationPage) -> str:
         datum=datum_words(page.calibration),
         eccentricity=_eccentricity(page.calibration),
         neglected=neglected_words(page.calibration),
-        ray_sd_px=float(np.sqrt(np.nanmean(page.numbers.ray_sd_px**2))),
+        ray_sd_px=page.numbers.mean_ray_sd_px,
         images=embedded_pictures(page.figures),
     )
 
