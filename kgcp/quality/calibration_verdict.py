@@ -32,6 +32,8 @@ _MAX_OPERATOR_RATIO = 3.0  # of a misfit to the standard deviation with which di
 _MAX_BAR_SDS = 3.0  # of a bar's residual
 _MIN_COVERAGE = 0.7
 _MIN_NORMALS_DEG = 15.0  # largest angle between two normals of the field
+_MAX_ALIGNMENT = 0.9  # length of the mean unit vector of the field's doubled directions
+_MIN_STRETCH = 0.001  # relative, of prints; pixels are mostly square to less
 _FOCAL_LEVEL = 0.001  # probability below which a change of the focal length is not by chance
 _MIN_FOCAL_CHANGE = 0.0005  # smallest such change, relative to the focal length
 _MAX_RADIUS_ERROR = 0.03  # relative, of the stated diameters
@@ -248,6 +250,7 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
         )
     yield from _handling_doubts(calibration, numbers)
     yield from _field_doubts(numbers)
+    yield from _aspect_doubts(calibration, numbers)
     yield from _bar_doubts(calibration)
     if never := discs_that_never_fit(calibration):
         discs = "disc {} does" if len(never) == 1 else "discs {} do"
@@ -320,6 +323,24 @@ def _field_doubts(numbers: CalibrationNumbers) -> Iterator[str]:
         )
 
 
+def _aspect_doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iterator[str]:
+    """Yield the doubt about two focal lengths that may be the field's stretch instead."""
+    is_stretch_possible = calibration.points_used is PointModel.FIXED
+    camera = calibration.camera
+    difference = abs(camera.fx / camera.fy - 1.0)
+    if is_stretch_possible and difference > _MIN_STRETCH and not _is_camera_turned(numbers):
+        yield (
+            f"fx and fy differ by {100.0 * difference:.2f} %, which may as well be a field that is"
+            " stretched in one direction: the camera was not turned about its axis"
+        )
+
+
+def _is_camera_turned(numbers: CalibrationNumbers) -> bool:
+    """Tell whether the camera was not held the same way, or upside down, in all photographs."""
+    turns = np.radians(numbers.turns_deg)
+    return float(np.abs(np.mean(np.exp(2j * turns)))) <= _MAX_ALIGNMENT
+
+
 def discs_that_never_fit(calibration: CameraCalibration) -> tuple[str, ...]:
     """Return the discs that are in several photographs but fit in none of them."""
     point = calibration.network.observations.point
@@ -387,16 +408,20 @@ def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
         or np.median(numbers.tilts_deg) < _MIN_NORMALS_DEG
     ):
         yield "Tilt the field by 25° to 40° about both axes, in all four directions."
-    turns = np.radians(numbers.turns_deg)
-    # 1 if the camera is held the same way, or upside down, in all photographs
-    alignment = float(np.abs(np.mean(np.exp(2j * turns))))
-    if alignment > 0.9:
+    if not _is_camera_turned(numbers):
         yield "Turn the camera by 90° in at least two photographs."
     if numbers.coverage < _MIN_COVERAGE:
         yield "Bring the field into the corners of the frame."
     if calibration.dropped or _fits_badly(numbers):
+        is_taken_as_stated = calibration.settings.points is PointModel.FIXED
+        if is_taken_as_stated:
+            yield (
+                "Let the field deviate from its description, which was taken as exact: prints are"
+                " often stretched in one direction, or uneven."
+            )
         if _is_aspect_untried(calibration):
-            yield "Estimate two focal lengths: the pixels may not be square."
+            two = "estimate two focal lengths: the pixels may not be square."
+            yield f"If that does not help, {two}" if is_taken_as_stated else two.capitalize()
         yield (
             "Keep zoom, focus and crop the same in all photographs, switch off the stabilisation,"
             " which moves lens or sensor, rotate no photograph afterwards, and keep the field"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
@@ -51,13 +52,14 @@ def views(
     noise_px: float = SD_PX,
     camera: Camera = CAMERA,
     distance_m: float = 0.33,
+    turns: Sequence[float] = TURNS,
 ) -> list[NamedView]:
     """Photographs of the field from six sides, with exact moments and noise."""
     rng = np.random.default_rng(18)
     points = FIELD.points_m() if bend_m is None else FIELD.points_m() + bend_m
     made = []
-    for index, turn in enumerate(TURNS):
-        angle = 2.0 * np.pi * index / len(TURNS)
+    for index, turn in enumerate(turns):
+        angle = 2.0 * np.pi * index / len(turns)
         about = np.array([np.cos(angle), np.sin(angle), 0.0])
         rotation = rotation_about(tilt * about) @ rotation_about(np.array([0.0, 0.0, turn]))
         middle = [0.03 * np.cos(angle), 0.02 * np.sin(angle), distance_m]
@@ -160,12 +162,38 @@ def test_two_focal_lengths_are_estimated_where_they_differ() -> None:
 
 @pytest.mark.usefixtures("_none_apart")
 def test_two_focal_lengths_are_advised_where_one_fits_badly_and_two_were_not_tried() -> None:
-    hint = "Estimate two focal lengths: the pixels may not be square."
+    hint = "If that does not help, estimate two focal lengths: the pixels may not be square."
     made = views(camera=replace(CAMERA, fy=1530.0))
     radial = calibrated(made)
     assert hint in judge(radial, calibration_numbers(radial)).advice
     chosen = calibrated(made, lens=LensModel.AUTO)
     assert hint not in judge(chosen, calibration_numbers(chosen)).advice
+
+
+@pytest.mark.usefixtures("_none_apart")
+@pytest.mark.parametrize("lens", [LensModel.RADIAL, LensModel.AUTO])
+def test_where_a_stretched_field_is_taken_as_exact_it_is_blamed_before_the_pixels(
+    lens: LensModel,
+) -> None:
+    result = calibrated(views(bend_m=0.003 * FIELD.points_m() * [1.0, 0.0, 0.0]), lens=lens)
+    advice = judge(result, calibration_numbers(result)).advice
+    blamed = [line for line in advice if "stretched" in line or "focal lengths" in line]
+    assert blamed[0].startswith("Let the field deviate from its description")
+    assert len(blamed) == (2 if lens is LensModel.RADIAL else 1)  # it has tried the pixels itself
+
+
+@pytest.mark.parametrize("is_turned", [True, False])
+def test_two_focal_lengths_of_an_unturned_camera_may_be_a_stretched_field(
+    *, is_turned: bool
+) -> None:
+    """Both fit as well, and fx is wrong by 0.16 % if it is the field."""
+    turns = TURNS if is_turned else (0.0, 0.0, 0.05, 3.14, 0.02, 0.01)
+    made = views(camera=replace(CAMERA, fy=1504.5), turns=turns)
+    settings = CalibrationSettings(PointModel.FIXED, LensModel.BROWN, is_same_aspect=False)
+    result = calibrate_camera(made, FIELD, (1600, 1200), settings)
+    verdict = judge(result, calibration_numbers(result))
+    assert ("fx and fy differ by 0.30 %, which may as well" in verdict.sentence) is not is_turned
+    assert (verdict.grade is CalibrationGrade.GOOD) is is_turned
 
 
 @pytest.mark.usefixtures("_none_apart")
