@@ -10,7 +10,7 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.io.flight.flight import Flight, require_flight
-from kgcp.io.images.frames import matching_frames
+from kgcp.io.images.frame_patterns import matching_frames
 from kgcp.io.images.remote import StoredFolder, frames_below
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.flight_inputs import (

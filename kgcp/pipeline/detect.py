@@ -17,7 +17,7 @@ from kgcp.io.files.atomic import remove
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight, require_flight
 from kgcp.io.formats.marks import HandMark, read_marks
-from kgcp.io.images.frames import matching_frames
+from kgcp.io.images.frame_patterns import matching_frames
 from kgcp.io.images.remote import StoredFolder, frames_below
 from kgcp.io.tables.columns import Row
 from kgcp.io.tables.detections import DETECTION_COLUMNS, detection_rows

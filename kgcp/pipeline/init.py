@@ -15,13 +15,14 @@ from kgcp.io.files.atomic import write_bytes
 from kgcp.io.files.csv_text import csv_text
 from kgcp.io.files.time_text import format_time
 from kgcp.io.flight.flight import read_target_tables
-from kgcp.io.flight.folder import FLIGHT_TOML, FolderContents, survey_folder
+from kgcp.io.flight.folder import FolderContents, survey_folder
 from kgcp.io.flight.target_table import target_lines
 from kgcp.io.flight.toml_draft import MISSING, DraftKey, DraftText
 from kgcp.io.formats.frame_times import read_times
 from kgcp.io.formats.name_times import times_of_names
 from kgcp.io.formats.point_table import PointTable, require_one_place
 from kgcp.io.images.exif import read_frame_header
+from kgcp.io.images.frames import FLIGHT_TOML
 from kgcp.pipeline.init_camera import camera_section
 from kgcp.pipeline.init_records import Gap, InitFinding, InitOptions, Part, Section
 from kgcp.pipeline.init_vehicle import crs_parts, vehicle_section

@@ -11,7 +11,7 @@ import pytest
 
 from kgcp.errors import KgcpError
 from kgcp.io.flight.flight import read_flight
-from kgcp.io.images.frames import matching_frames
+from kgcp.io.images.frame_patterns import matching_frames
 from kgcp.io.tables.detections import read_detections
 from kgcp.pipeline.detect import NoProgress, RunOptions, detect_flight
 from tests.cli.conftest import FRAMES, SampleFlight

@@ -24,11 +24,13 @@ from benchmarks.first_flight.bare_folders import (
 )
 from kgcp.cli import main
 from kgcp.cli.init import quoted
+from kgcp.errors import KgcpWarning
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.io.flight.camera_file import camera_toml
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight, read_flight
+from kgcp.io.flight.folder import survey_folder
 from kgcp.io.images.exif import read_frame_header
 from kgcp.io.images.frames import list_frames
 from kgcp.measurement.exif_camera import ExifCamera
@@ -455,6 +457,15 @@ def test_a_trajectory_that_cannot_be_read_is_named(bare: Path, tmp_path: Path) -
     check = CliRunner().invoke(main, ["check", str(folder)])
     assert check.exit_code == 1
     assert "line 6: has 1 cells after the time" in " ".join(check.stdout.split())
+
+
+def test_files_of_a_flight_within_the_folder_are_not_surveyed(bare: Path, tmp_path: Path) -> None:
+    folder = copied(bare, "dji", tmp_path)
+    before = survey_folder(folder)
+    inner = shutil.copytree(folder, folder / "second")
+    (inner / "flight.toml").touch()
+    with pytest.warns(KgcpWarning, match="in second, which is another flight"):
+        assert survey_folder(folder) == before
 
 
 def test_results_in_the_frames_own_folder_are_no_frames(bare: Path, tmp_path: Path) -> None:

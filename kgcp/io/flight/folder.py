@@ -22,9 +22,7 @@ from kgcp.io.formats.trajectories import sbet, tum
 from kgcp.io.formats.trajectories.first_epoch import TrajectoryFile
 from kgcp.io.formats.trajectories.foreign_csv import recognised_table
 from kgcp.io.formats.waypoint_export import looks_like_waypoint
-from kgcp.io.images.frames import FRAME_SUFFIXES, RESULTS_NAME, list_frames
-
-FLIGHT_TOML = "flight.toml"
+from kgcp.io.images.frames import FLIGHT_TOML, FRAME_SUFFIXES, RESULTS_NAME, list_frames
 
 _TABLE_SUFFIXES = frozenset({".csv", ".txt", ".pos", ".out", ".sbet", ".tum", ".dat", ".asc"})
 _DATA_SUFFIXES = _TABLE_SUFFIXES | {
@@ -105,20 +103,22 @@ def survey_folder(folder: Path) -> FolderContents:
 
 
 def _files_below(folder: Path) -> list[Path]:
-    """Return the files, sorted, without those in folders that kgcp has made."""
+    """Return the files, sorted, without those of other flights and in folders that kgcp made."""
     paths = []
     for parent, folders, names in os.walk(folder):
         is_printed = TARGETS_TOML in names and Path(parent) != folder
         kept = [TARGETS_TOML] if is_printed else names  # the others are sheets, perhaps PNG
-        folders[:] = [name for name in folders if name[0] != "." and not _is_made(parent, name)]
+        folders[:] = [name for name in folders if not _is_passed_over(parent, name)]
         paths += [Path(parent) / name for name in kept if name[0] != "."]
     made = folder / RESULTS_NAME / "targets" / TARGETS_TOML
     return sorted([*filter(is_file, paths), *([made] if is_file(made) else [])])
 
 
-def _is_made(parent: str, name: str) -> bool:
-    """Whether a folder has results or a contact sheet."""
-    return name == RESULTS_NAME or is_folder(Path(parent) / name / "thumbnails")
+def _is_passed_over(parent: str, name: str) -> bool:
+    """Whether a folder is hidden, has results or a contact sheet, or is another flight."""
+    path = Path(parent) / name
+    is_made = name == RESULTS_NAME or is_folder(path / "thumbnails")
+    return name[0] == "." or is_made or is_file(path / FLIGHT_TOML)
 
 
 def _frames_folder(folder: Path, paths: Sequence[Path]) -> Path:

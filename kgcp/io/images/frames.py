@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fnmatch
 import os
 import re
 import sys
@@ -39,10 +38,10 @@ FRAME_SUFFIXES = frozenset(
     {".bmp", ".jp2", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
 )
 
+FLIGHT_TOML = "flight.toml"
+
 RESULTS_NAME = "kgcp"
 """Name of the results folder in the flight's folder."""
-
-_SHOWN_FRAMES = 3
 
 _RAW_SUFFIXES = frozenset(
     {".3fr", ".arw", ".cr2", ".cr3", ".dng", ".erf", ".fff", ".iiq", ".mef", ".nef", ".nrw"}
@@ -87,8 +86,8 @@ def list_frames(folder: Path, remedy: str = CORRECT_FOLDER) -> list[str]:
 
     Hidden files and folders are skipped. Images are recognised by their suffix, in upper or lower
     case. Links to files are followed; links to folders below `folder` are not, as they may be
-    circular. If the frames are in the flight's own folder, its results folder is skipped. `remedy`
-    says what to do if this is not the right folder.
+    circular. If the frames are in the flight's own folder, its results folder is skipped. So are
+    folders of other flights. `remedy` says what to do if this is not the right folder.
 
     Raises
     ------
@@ -98,12 +97,8 @@ def list_frames(folder: Path, remedy: str = CORRECT_FOLDER) -> list[str]:
     if not is_folder(folder):
         raise KgcpError(f"{folder}: is not a folder; {remedy}")
     names = []
-    is_flight = is_file(folder / "flight.toml")
     for parent, folders, files in os.walk(folder, onerror=_refuse_folder):
-        is_top = is_flight and Path(parent) == folder
-        folders[:] = [
-            name for name in folders if name[0] != "." and not (is_top and name == RESULTS_NAME)
-        ]
+        folders[:] = [name for name in folders if name[0] != "."]
         names += [(Path(parent) / name).relative_to(folder).as_posix() for name in files]
     frames = frames_among(names, str(folder), remedy)
     for name in frames:
@@ -121,6 +116,9 @@ def frames_among(names: Sequence[str], folder: str, remedy: str = CORRECT_FOLDER
         If there are none. The message says what the folder holds instead.
     """
     visible = [name for name in names if not any(part[0] == "." for part in name.split("/"))]
+    if FLIGHT_TOML in visible:
+        visible = [name for name in visible if not name.startswith(f"{RESULTS_NAME}/")]
+    visible = _without_other_flights(visible, folder)
     frames = [name for name in visible if PurePosixPath(name).suffix.lower() in FRAME_SUFFIXES]
     if frames:
         _warn_of_left_out(visible, frames, folder)
@@ -136,6 +134,27 @@ def frames_among(names: Sequence[str], folder: str, remedy: str = CORRECT_FOLDER
     raise KgcpError(
         f"{folder}: holds no images that kgcp reads, but {count} {suffix} {kind}; {conversion}"
     )
+
+
+def _without_other_flights(names: Sequence[str], folder: str) -> list[str]:
+    """Return the files that are not below another flight.toml, and warn of frames that are."""
+    paths = [PurePosixPath(name) for name in names]
+    others = {path.parent for path in paths if path.name == FLIGHT_TOML} - {PurePosixPath()}
+    own, left_out = [], Counter[str]()
+    for path in paths:
+        flight = next((str(parent) for parent in path.parents if parent in others), None)
+        if flight is None:
+            own.append(str(path))
+        elif path.suffix.lower() in FRAME_SUFFIXES:
+            left_out[flight] += 1
+    for flight, count in sorted(left_out.items()):
+        warnings.warn(
+            f"{folder}: leaves out {count} images in {flight}, which is another flight: it has a"
+            f" {FLIGHT_TOML} of its own; delete that if they belong to this one",
+            KgcpWarning,
+            stacklevel=4,
+        )
+    return own
 
 
 def _warn_of_left_out(names: Sequence[str], frames: Sequence[str], folder: str) -> None:
@@ -154,44 +173,6 @@ def _warn_of_left_out(names: Sequence[str], frames: Sequence[str], folder: str) 
             KgcpWarning,
             stacklevel=3,
         )
-
-
-def matching_frames(frames: Sequence[str], patterns: Sequence[str]) -> list[str]:
-    """Return the frames that match one of the patterns, in the given order; all without patterns.
-
-    Parameters
-    ----------
-    frames : sequence of str
-        Paths below the frames folder.
-    patterns : sequence of str
-        Of such paths, in the notation of `fnmatch`: `*` also matches `/`, and letter case counts.
-        Backslashes may separate folders.
-
-    Raises
-    ------
-    KgcpError
-        If a pattern matches no frame. The message names some frames.
-    """
-    if not patterns:
-        return list(frames)
-    for pattern in patterns:
-        if not any(is_chosen(frame, (pattern,)) for frame in frames):
-            examples = ", ".join(frames[:_SHOWN_FRAMES])
-            raise KgcpError(
-                f"{pattern!r} matches none of {len(frames)} frames ({examples}, …); give a pattern"
-                ' of their paths below the frames folder, such as "*_00??.JPG"',
-                option="frames",
-            )
-    return [frame for frame in frames if is_chosen(frame, patterns)]
-
-
-def is_chosen(frame: str, patterns: Sequence[str]) -> bool:
-    """Return whether a frame matches one of the patterns of `matching_frames`."""
-    return any(
-        fnmatch.fnmatchcase(frame, form)
-        for pattern in patterns
-        for form in (pattern, pattern.replace("\\", "/"))
-    )
 
 
 def kind_of(suffix: str) -> tuple[str, str]:

@@ -21,7 +21,8 @@ from kgcp.io.files.time_text import format_time
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.frame_times import FrameTimes
-from kgcp.io.images.frames import RESULTS_NAME, is_chosen, list_frames
+from kgcp.io.images.frame_patterns import is_chosen
+from kgcp.io.images.frames import RESULTS_NAME, list_frames
 from kgcp.io.images.remote import stamps_of
 from kgcp.io.tables.provenance import (
     TARGET_TABLE,

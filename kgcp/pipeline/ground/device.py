@@ -8,7 +8,8 @@ from pathlib import Path
 from kgcp.errors import Rejection
 from kgcp.io.flight.device_file import EoDevice
 from kgcp.io.flight.flight import Flight
-from kgcp.io.images.frames import list_frames, matching_frames, read_grey
+from kgcp.io.images.frame_patterns import matching_frames
+from kgcp.io.images.frames import list_frames, read_grey
 from kgcp.measurement.enclosed_discs import centres_and_covariances, enclosed_discs
 from kgcp.network.ground.device import DevicePose, orient_by_device
 from kgcp.network.ground.resection import NoPoseError

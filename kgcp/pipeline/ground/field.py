@@ -12,7 +12,8 @@ import numpy as np
 from kgcp.errors import Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.io.flight.flight import Flight
-from kgcp.io.images.frames import list_frames, matching_frames, read_grey
+from kgcp.io.images.frame_patterns import matching_frames
+from kgcp.io.images.frames import list_frames, read_grey
 from kgcp.measurement.discs.records import Operator
 from kgcp.measurement.exif_camera import ExifCamera
 from kgcp.measurement.field_photograph import (

@@ -19,7 +19,7 @@ from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.io.files.atomic import write_bytes
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
-from kgcp.io.images.frames import matching_frames
+from kgcp.io.images.frame_patterns import matching_frames
 from kgcp.io.tables.columns import row_of
 from kgcp.io.tables.detections import read_attempts
 from kgcp.io.tables.parquet import write_table

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from kgcp.errors import KgcpError, Reason, Rejection
+from kgcp.errors import KgcpError, KgcpWarning, Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.io.images.frames import list_frames, read_grey
@@ -71,6 +71,19 @@ class TestListFrames:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.touch()
         assert list_frames(tmp_path) == sorted(names)
+
+    def test_frames_and_results_of_a_flight_within_this_one_are_left_out(
+        self, tmp_path: Path
+    ) -> None:
+        """A sheet with a perfect target among the results would be measured, too."""
+        others = ["b/2.jpg", "b/frames/c/3.jpg", "b/kgcp/targets/target_A.png"]
+        for name in ["1.jpg", "a/1.jpg", "flight.toml", "kgcp/x.png", "b/flight.toml", *others]:
+            path = tmp_path / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+        with pytest.warns(KgcpWarning, match="leaves out 3 images in b, which is another flight"):
+            assert list_frames(tmp_path) == ["1.jpg", "a/1.jpg"]
+        assert list_frames(tmp_path / "b") == ["2.jpg", "frames/c/3.jpg"]
 
     def test_an_empty_folder_is_an_error(self, tmp_path: Path) -> None:
         with pytest.raises(KgcpError, match=r"holds no images; .*\[frames\] folder"):
