@@ -124,6 +124,21 @@ def test_new_targets_do_not_replace_those_of_an_earlier_run(tmp_path: Path) -> N
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+def test_more_targets_for_a_flight_differ_from_those_of_an_earlier_run(tmp_path: Path) -> None:
+    """In another folder alone, codes and names would be the same again."""
+    arguments = ("--new", "1", "--format", "svg")
+    first = tmp_path / "first"
+    assert run(*arguments, "--diameter", "0.15", "--out", first).exit_code == 0
+    refused = run(*arguments, "--diameter", "0.5", "--out", first)
+    assert "copy its tables into flight.toml and name that flight" in refused.stderr
+    (tmp_path / "flight.toml").write_bytes((first / "targets.toml").read_bytes())
+    assert run(tmp_path, *arguments, "--diameter", "0.5").exit_code == 0
+    (old,) = read_printed_targets(tmp_path)
+    (new,) = read_back(tmp_path / "new", tmp_path / "kgcp" / "targets" / "targets.toml")
+    assert (old.name, new.name) == ("T1", "T2")
+    assert old.ring.code_deg != new.ring.code_deg
+
+
 def test_targets_of_flight_toml_are_written_again_after_a_change(flight: Path) -> None:
     assert run(flight, "--new", "1", "--format", "svg").exit_code == 0
     refused = run(flight, "--target", "A", "--format", "svg")

@@ -219,7 +219,9 @@ def refuse_to_lose_targets(
     if lost:
         raise KgcpError(
             f"{path}: has {', '.join(lost)} of an earlier run, whose codes and lengths would be"
-            " lost; write to another folder, or delete the file if these are not printed",
+            " lost; to draw more for the same flight, copy its tables into flight.toml and name"
+            " that flight, so that codes differ; otherwise write to another folder, or delete the"
+            " file if these are not printed",
             option="out",
         )
 
