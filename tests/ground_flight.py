@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -132,7 +133,9 @@ class GroundFlight:
             for frame in range(self.frames)
             for target in range(len(self.names))
         ]
-        write_table(folder / "kgcp" / "detections.parquet", DETECTION_COLUMNS, rows, {})
+        sizes = [(folder / "frames" / name).stat().st_size for name in self.frame_names]
+        about = {"frame_bytes": json.dumps(sizes)}
+        write_table(folder / "kgcp" / "detections.parquet", DETECTION_COLUMNS, rows, about)
         return folder
 
     def _toml(self, sd_position_m: float) -> str:

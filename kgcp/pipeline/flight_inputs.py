@@ -29,7 +29,11 @@ from kgcp.io.images.exif import read_frame_header
 from kgcp.io.images.frames import list_frames
 from kgcp.io.images.remote import StoredFolder, at_hand
 from kgcp.io.tables.provenance import TARGET_TABLE
-from kgcp.io.tables.staleness import changed_since_orient, listed_changes
+from kgcp.io.tables.staleness import (
+    changed_since_orient,
+    frames_of_other_poses,
+    listed_changes,
+)
 from kgcp.pipeline.frame_priors import motions_while_read
 from kgcp.quality.checks.calibration import check_camera
 from kgcp.quality.checks.camera_position import check_camera_position
@@ -65,6 +69,7 @@ from kgcp.quality.checks.reference import check_reference, check_visibility
 from kgcp.quality.checks.spikes import check_spikes
 from kgcp.quality.checks.static_targets import check_overlaps
 from kgcp.quality.consistency import Consistency, study_consistency
+from kgcp.quality.number_text import counted
 
 SAMPLED_FRAMES = 100
 """Headers that are read where a command has other work to do."""
@@ -397,8 +402,20 @@ def _has_wrong_places(doubts: Sequence[Doubt]) -> bool:
 def outdated_poses(file: Path, flight: Flight) -> tuple[Doubt, ...]:
     """Return the doubt about poses by `kgcp orient` if flight.toml has been changed since.
 
-    It is grave if camera or crs have been changed.
+    It is grave if camera or crs have been changed, or if the poses are those of other frames.
     """
+    others = frames_of_other_poses(file, flight)
+    if others:
+        return (
+            grave(
+                Cause.REFERENCE,
+                f"{file}: 'kgcp orient' computed these poses from other files than"
+                f" {counted(len(others), 'frame')} of this flight ({others[0]}"
+                f"{', …' if others[1:] else ''}), perhaps of another flight with such names",
+                "give the poses of this flight; or repeat 'kgcp detect' and 'kgcp orient' if its"
+                " frames have been changed",
+            ),
+        )
     changes = changed_since_orient(file, flight)
     if not changes:
         return ()

@@ -258,6 +258,30 @@ def test_poses_from_before_a_change_of_flight_toml_are_doubted(
     assert str(camera) in run("export-gcp", folder).stderr
 
 
+@pytest.mark.usefixtures("no_place_figures")
+@pytest.mark.parametrize("frames", [None, "f_00[01].png"])
+def test_poses_of_another_flight_with_the_same_names_are_doubted(
+    tmp_path: Path, frames: str | None
+) -> None:
+    """They would keep static targets, which seem to have given them, from being compared."""
+    folder = GroundFlight(frames=3).write(tmp_path / "flight")
+    assert run("orient", folder, *(() if frames is None else ("--frames", frames))).exit_code == 0
+    other = GroundFlight(frames=3, seed=2).write(tmp_path / "other")
+    poses = folder / "kgcp" / "poses.csv"
+    assert not outdated_poses(poses, read_flight(folder))
+    for frame in (other / "frames").iterdir():
+        cv2.imwrite(str(frame), np.full((5, 5), 7, np.uint8))
+    (folder / "frames" / "f_002.png").unlink()  # frames that are gone do not matter
+    assert not outdated_poses(poses, read_flight(folder))
+    doubts = outdated_poses(poses, read_flight(other))
+    if frames is not None:  # it is not known which sizes are those of the chosen frames
+        assert not doubts
+        return
+    (doubt,) = doubts
+    assert (doubt.code, doubt.is_grave) == (Cause.REFERENCE, True)
+    assert "from other files than 3 frames of this flight (f_000.png, …)" in doubt.sentence
+
+
 def test_positions_without_stated_accuracy_are_named(tmp_path: Path) -> None:
     """Their errors are not part of the poses' standard deviations."""
     folder = GroundFlight(frames=3).write(tmp_path / "flight")

@@ -120,20 +120,37 @@ def changed_since_orient(poses: Path, flight: Flight) -> list[str]:
     poses : Path
         File of the reference poses.
     """
-    metadata = _orientation_metadata(poses, flight)
-    if metadata is None:
+    table = _orientation_table(poses, flight)
+    if table is None:
         return []
+    metadata = pq.read_schema(table).metadata
     then = _json(metadata, b"kgcp.orientation_inputs")
     return [*_changed_keys(then, orientation_inputs(flight))]
 
 
 def are_by_orient(poses: Path, flight: Flight) -> bool:
     """Tell whether `kgcp orient` computed reference poses, from the flight's static targets."""
-    return _orientation_metadata(poses, flight) is not None
+    return _orientation_table(poses, flight) is not None
 
 
-def _orientation_metadata(poses: Path, flight: Flight) -> Mapping[bytes, bytes] | None:
-    """Return the metadata of the table that `kgcp orient` wrote with reference poses.
+def frames_of_other_poses(poses: Path, flight: Flight) -> list[str]:
+    """Return the frames that `kgcp orient` has oriented by files other than the flight's.
+
+    Two flights mostly have frames of the same names. Frames that are gone do not count.
+    """
+    table, frames_now = _orientation_table(poses, flight), _frames_now(flight)
+    if table is None or frames_now is None:
+        return []
+    frames = pq.read_table(table, columns=["frame"])["frame"].to_pylist()
+    detections = _json(pq.read_schema(table).metadata, b"kgcp.detections")
+    then = {f"kgcp.{key}".encode(): str(value).encode() for key, value in detections.items()}
+    count = len(_values(then, b"kgcp.frame_bytes"))
+    known = sorted(frames) if len(frames) == count else []  # the sizes are those of all frames
+    return _changed_files([*set(frames) & set(frames_now)], known, flight, then)
+
+
+def _orientation_table(poses: Path, flight: Flight) -> Path | None:
+    """Return the table that `kgcp orient` wrote with reference poses.
 
     The table lies beside them, or in the flight's results, and states their digest. None: the poses
     are by another program.
@@ -148,7 +165,7 @@ def _orientation_metadata(poses: Path, flight: Flight) -> Mapping[bytes, bytes] 
         except (OSError, pa.ArrowException):  # no table, or a damaged one
             continue
         if metadata.get(b"kgcp.poses_csv") == found:
-            return metadata
+            return folder / POSES_TABLE
     return None
 
 
@@ -354,6 +371,27 @@ def _changed_frames(
     if new:
         yield f"{len(new)} new frames ({new[0]}, …)" if len(new) > 1 else f"a new frame ({new[0]})"
         return
+    changed = _changed_files(frames_now, known, flight, metadata)
+    if changed:
+        more = ", …" if len(changed) > 1 else ""
+        yield f"files of {counted(len(changed), 'frame')} ({changed[0]}{more})"
+
+
+def _changed_files(
+    frames_now: Sequence[str],
+    known: Sequence[str],
+    flight: Flight,
+    metadata: Mapping[bytes, bytes],
+) -> list[str]:
+    """Return the frames whose files have another size or content than detections state.
+
+    Parameters
+    ----------
+    known : sequence of str
+        Frames of the detections, in the order of their sizes.
+    metadata : mapping
+        Of the detections.
+    """
     sizes_then = dict(zip(known, _values(metadata, b"kgcp.frame_bytes"), strict=False))
     stamps = zip(frames_now, stamps_of(flight.frames_folder, frames_now), strict=True)
     sizes_now = {frame: None if stamp is None else stamp[0] for frame, stamp in stamps}
@@ -368,6 +406,4 @@ def _changed_frames(
             and content_sample(flight.frames_folder / frame, size)
             not in {samples_then[frame], None}
         ]
-    if changed:
-        more = ", …" if len(changed) > 1 else ""
-        yield f"files of {counted(len(changed), 'frame')} ({changed[0]}{more})"
+    return sorted(changed)
