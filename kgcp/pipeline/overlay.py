@@ -170,6 +170,8 @@ def _sketch(job: DetectionJob, grey: GreyArray, frame: str, ring: Outcome | Cons
     share = None if residual_image is None else 100.0 * residual_image.edge_noise
     if residual_image is not None and residual_image.white is not None:
         note = f"uneven light: white from {np.nanmin(residual_image.white):.0%} of its largest"
+        if residual_image.may_be_hidden:
+            note = "something seems to hide a part of the plate, or its light is very uneven"
     return Sketch(_card(frame, ring, share, note), draw_ring(grey, view))
 
 

@@ -29,6 +29,9 @@ from kgcp.targets.layout import Target
 _ANGLES = np.linspace(0.0, 2.0 * np.pi, 97)
 _UNIT_CIRCLE = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))
 _USUAL_BLUR_PX = 0.7
+# Share of its largest value below which white is no light. In simulated shadow, dirt and highlights
+# it is 0.4 or more; what hides a plate is fitted as light of down to -8.
+_LEAST_LIGHT = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,8 +45,15 @@ class ResidualImage:
     share: FloatArray
     edge_noise: float  # median residual near edges, without hidden pixels
     # (height, width): the fitted level of white relative to its largest value on the plate; NaN
-    # where `share` is; None: the light is even
+    # where `share` is, and where it is too low to be light; None: the light is even
     white: FloatArray | None = None
+
+    @property
+    def may_be_hidden(self) -> bool:
+        """Whether a part of the plate is so dark that something seems to hide it."""
+        if self.white is None:
+            return False
+        return bool(np.any(np.isnan(self.white) & np.isfinite(self.share)))
 
 
 def residual_image_of(
@@ -100,6 +110,7 @@ def residual_image_of(
         white_share = np.full(len(share), np.nan)
         white_share[sample.index] = 1.0 + parameters.field.added(sample.pixels)[1]
         white_share /= np.nanmax(white_share)
+        white_share[white_share < _LEAST_LIGHT] = np.nan
 
     def of_pixels(values: FloatArray) -> FloatArray:
         return np.asarray(np.kron(values.reshape(shape), np.ones((binning, binning))))

@@ -86,7 +86,22 @@ def test_slight_shade_on_a_small_ring_shows_in_the_residuals(
     left = residual_image_of(grey, camera, TARGET_PLATE.target, pose, 0.8)
     assert left.white is not None
     assert 0.8 < np.nanmin(left.white) < 0.97
+    assert not left.may_be_hidden
     assert left.edge_noise < 0.02
+
+
+def test_what_hides_a_part_of_the_plate_is_not_taken_for_light(
+    camera: Camera, target: Target, draw_frame: DrawFrame, pose: Pose
+) -> None:
+    """The fit explains black by light that takes grey values away, which does not exist."""
+    grey = draw_frame((target, pose), noise=NOISE)
+    x_px = camera.project(pose.translation_m)[0]
+    grey[:, round(x_px) + 22 :] = 0
+    left = residual_image_of(grey, camera, target, pose, 0.8)
+    assert left.white is not None
+    assert np.nanmin(left.white) >= 0.1
+    assert np.nanmax(left.white) == 1.0
+    assert left.may_be_hidden
 
 
 def test_contours_are_closed_and_distorted_as_the_camera_does(
