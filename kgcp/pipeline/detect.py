@@ -44,7 +44,7 @@ from kgcp.pipeline.execution.journal import Journal, fingerprint, to_text
 from kgcp.pipeline.execution.kept_frames import KeptFrames, kept_frames, remove_kept_frames
 from kgcp.pipeline.execution.profiling import OTHER
 from kgcp.pipeline.execution.threads import single_threaded
-from kgcp.pipeline.frame_priors import priors_of_frames
+from kgcp.pipeline.frame_priors import Priors, priors_of_frames
 from kgcp.pipeline.frame_task import DetectionJob, FrameInput, examine_frame
 from kgcp.pipeline.guidance import (
     ContradictedMarks,
@@ -268,14 +268,16 @@ def _prepared_task(flight: Flight, settings: DetectSettings, options: RunOptions
     all_frames = frames_below(options.stored_frames or flight.frames_folder)
     frames = matching_frames(all_frames, options.frame_patterns)
     data = FlightData(flight, all_frames)
+    # the frames around tell how a chosen one turned while it was read, chosen or not
+    priors = dict(zip(all_frames, priors_of_frames(flight, data, all_frames), strict=True))
     return _DetectionTask(
         flight=flight,
         settings=settings,
         options=options,
         data=data,
         all_frames=all_frames,
-        inputs=_frame_inputs(flight, data, frames),
-        marks=_marks(flight, data, all_frames, options.places),
+        inputs=_frame_inputs(flight, data, {frame: priors[frame] for frame in frames}),
+        marks=_marks(flight, data, priors, options.places),
         sheet=None if options.overlay is None else _sheet(flight, options.overlay),
     )
 
@@ -305,23 +307,22 @@ def _kept_frames(
     return kept_frames(folder)
 
 
-def _frame_inputs(flight: Flight, data: FlightData, frames: Sequence[str]) -> list[FrameInput]:
-    """Return the frames with prior knowledge of each."""
+def _frame_inputs(
+    flight: Flight, data: FlightData, priors: Mapping[str, Priors]
+) -> list[FrameInput]:
+    """Return frames with prior knowledge of each."""
     times = data.frame_times.time_s
-    all_priors = priors_of_frames(flight, data, frames)
-    rows = zip(
-        frames, all_priors, static_by_reference(flight, data, frames, all_priors), strict=True
-    )
+    references = static_by_reference(flight, data, [*priors], [*priors.values()])
     return [
         FrameInput(
             frame,
             times.get(frame),
-            priors,
+            of_frame,
             flight.may_use_exif_times,
             by_reference.plain,
             by_reference.coded,
         )
-        for frame, priors, by_reference in rows
+        for (frame, of_frame), by_reference in zip(priors.items(), references, strict=True)
     ]
 
 
@@ -385,7 +386,7 @@ def _likely_cause(run: DetectionRun, stopwatch: Stopwatch) -> str | None:
 
 
 def _marks(
-    flight: Flight, data: FlightData, frames: Sequence[str], places: Path | None
+    flight: Flight, data: FlightData, priors: Mapping[str, Priors], places: Path | None
 ) -> Mapping[str, Sequence[HandMark]]:
     if places is None:
         return {}
@@ -397,7 +398,7 @@ def _marks(
             option="places",
         )
     static = {target.name for target in flight.static_targets}
-    marks = read_marks(places, set(frames), static, flight.camera)
+    marks = read_marks(places, set(priors), static, flight.camera)
     for frame, in_frame in marks.items():
         by_target = {mark.target: mark.place for mark in in_frame}
         names = exchanged_marks(by_target, data.static_positions.static, flight.camera)
@@ -408,7 +409,6 @@ def _marks(
                 " exchanged; exchange their names, or look at their position_m",
                 option="places",
             )
-    priors = dict(zip(frames, priors_of_frames(flight, data, frames), strict=True))
     wrong = marks_against_reference(flight, data, marks, priors)
     if wrong is not None:
         raise KgcpError(f"{places}: {_contradiction(wrong)}", option="places")

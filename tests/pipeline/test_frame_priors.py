@@ -11,7 +11,9 @@ import pytest
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight, read_flight
 from kgcp.measurement.plate_prior import NormalPrior, PlatePrior
+from kgcp.pipeline.detect import RunOptions, _prepared_task
 from kgcp.pipeline.frame_priors import priors_of_frames
+from kgcp.settings import DetectSettings
 from kgcp.targets.plain import PlainPolarity, PlainTarget
 
 SAMPLE = Path(__file__).parents[2] / "sample_flight"
@@ -31,6 +33,19 @@ def test_priors_of_normals_follow_from_attitudes() -> None:
     directions = np.array([normal.direction_camera for normal in normals if normal is not None])
     assert (directions[:, 2] > np.cos(np.radians(30.0))).all()
     assert all(prior.rotation is None for each in known.values() for prior in each.values())
+
+
+def test_priors_of_chosen_frames_are_those_of_a_whole_run() -> None:
+    """How the camera turned while a frame was read follows from frames that were not chosen."""
+    flight = read_flight(SAMPLE)
+    flight = replace(flight, camera=replace(flight.camera, readout_s=0.03))
+    whole = _prepared_task(flight, DetectSettings(), RunOptions()).inputs
+    chosen = RunOptions(frame_patterns=("*_0004.jpg", "*_0010.jpg"))
+    few = _prepared_task(flight, DetectSettings(), chosen).inputs
+    rotations = {each.frame: each.priors["A"].rotation for each in whole}
+    assert [each.frame for each in few] == ["frame_0004.jpg", "frame_0010.jpg"]
+    assert all(each.priors["A"].rotation is not None for each in few)
+    assert [each.priors["A"].rotation for each in few] == [rotations[each.frame] for each in few]
 
 
 def test_a_target_that_stands_still_is_not_taken_for_the_vehicle_s() -> None:
