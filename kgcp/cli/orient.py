@@ -166,8 +166,17 @@ def _report(poses: FlightPoses) -> None:
     reasons = Counter(each.reason for each in poses.poses if each.pose is None)
     for reason, count in reasons.most_common():
         click.echo(f"  {count:6d} {reason}", err=True)
+    _report_left_out(poses)
+    for doubt in poses.doubts:
+        click.echo(f"kgcp: doubt: {doubt}", err=True)
+    if poses.focal_px is not None:
+        focal, sd = poses.focal_px
+        click.echo(f"focal length {focal:.2f} ± {sd:.2f} px", err=True)
+
+
+def _report_left_out(poses: FlightPoses) -> None:
     left_out: dict[str, list[str]] = {}
-    for each in oriented:
+    for each in poses.oriented:
         if not each.is_by_one_ring:
             for name in each.targets:
                 if name not in each.used:
@@ -175,15 +184,20 @@ def _report(poses: FlightPoses) -> None:
     for name, frames in left_out.items():
         where = ", ".join(frames)
         if len(frames) > _MAX_NAMED:
-            measured = sum(name in each.targets for each in oriented)
+            measured = sum(name in each.targets for each in poses.oriented)
             where = f"{len(frames)} of {measured} frames, first in {frames[0]}"
-            where += "; check its position_m and diameter" if 2 * len(frames) > measured else ""
+            if 2 * len(frames) > measured:
+                where += f"; {what_to_check(name, poses.suspects)}"
         click.echo(f"kgcp: doubt: {name} left out in {where}", err=True)
-    for doubt in poses.doubts:
-        click.echo(f"kgcp: doubt: {doubt}", err=True)
-    if poses.focal_px is not None:
-        focal, sd = poses.focal_px
-        click.echo(f"focal length {focal:.2f} ± {sd:.2f} px", err=True)
+
+
+def what_to_check(left_out: str, suspects: Sequence[str]) -> str:
+    """Return what to check if most frames leave a target out."""
+    others = [name for name in suspects if name != left_out]
+    if left_out in suspects and others:
+        # three wrong targets leave out a right one as well as three right ones a wrong one
+        return f"its position is wrong, or that of {' or '.join(others)}"
+    return "check its position_m and diameter"
 
 
 def _refuse_together(given: Mapping[str, bool]) -> None:

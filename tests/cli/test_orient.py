@@ -17,6 +17,7 @@ from click.testing import CliRunner, Result
 
 from benchmarks.ground.orient import DEVICE_M
 from kgcp.cli import main
+from kgcp.cli.orient import what_to_check
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, rotation_about
@@ -422,6 +423,20 @@ def test_a_target_with_a_wrong_name_is_left_out(tmp_path: Path) -> None:
     assert (table["chi2"][table["used"]] < 25.0).all()
     assert (table["chi2"][~table["used"]] > 100.0).all()
     assert (table["residual_distance_percent"][table["used"]].abs() < 0.5).all()
+
+
+@pytest.mark.parametrize(
+    ("suspects", "words"),
+    [
+        (("B", "C"), "its position is wrong, or that of B"),
+        (("C",), "check its position_m"),
+        ((), "check its position_m"),
+    ],
+)
+def test_a_left_out_target_is_not_blamed_for_what_another_may_be(
+    suspects: tuple[str, ...], words: str
+) -> None:
+    assert words in what_to_check("C", suspects)
 
 
 def test_a_misplaced_target_is_reported_once_for_all_frames(tmp_path: Path) -> None:

@@ -30,11 +30,13 @@ def checked(
     noise: float = 1.0,
     move_m: float = 0.0,
     motion_px: float = 0.0,
+    left_out: int | None = None,
 ) -> tuple[str, WrongPosition | MovedTarget | None]:
     """The target with a wrong height, and the result of the check; noise in stated deviations.
 
     It is `move_m` further north in the second half of the frames. In each frame, the image moves by
-    some `motion_px` from the first row to the last.
+    some `motion_px` from the first row to the last. All frames leave out the target so many after
+    the wrong one, if any.
     """
     rng = np.random.default_rng(seed)
     names = tuple("ABCDEF"[:targets])
@@ -68,7 +70,9 @@ def checked(
         ]
         pose = CameraPose(flight.centres[row], flight.rotations[row])
         zeros = np.zeros((targets, 3))
-        poses.append(FramePose(frame, names, pose, np.eye(6), names, "", residuals=zeros))
+        out = None if left_out is None else names[(seed + left_out) % targets]
+        used = tuple(name for name in names if name != out)
+        poses.append(FramePose(frame, names, pose, np.eye(6), used, "", residuals=zeros))
     places_m = flight.positions + sd_m * rng.standard_normal((targets, 3))
     wrong = seed % targets
     places_m[wrong, 2] += off_m
@@ -93,6 +97,20 @@ def test_the_wrong_position_is_named_among_few_others(
     assert named[0] < float(np.mean([len(wrong.targets) for _, wrong in found_wrong])) < named[1]
     off_m = [wrong.off_m for true, wrong in found_wrong if wrong.targets[0] == true]
     assert float(np.median(off_m)) == pytest.approx(0.1, rel=0.25)
+
+
+@pytest.mark.parametrize("targets", [4, 5])
+@pytest.mark.parametrize("left_out", [0, 1])
+def test_a_right_target_that_frames_leave_out_is_not_blamed_alone(
+    targets: int, left_out: int
+) -> None:
+    """Three others that agree with a wrong height leave out a right one."""
+    found = [checked(targets, seed, off_m=0.1, left_out=left_out) for seed in range(12)]
+    found_wrong = [(true, wrong) for true, wrong in found if isinstance(wrong, WrongPosition)]
+    assert len(found_wrong) >= 7
+    assert all(true in wrong.targets for true, wrong in found_wrong)
+    right = [checked(targets, seed, left_out=left_out)[1] for seed in range(12)]
+    assert right == [None] * 12
 
 
 @pytest.mark.parametrize("sd_m", [0.0003, 0.01])

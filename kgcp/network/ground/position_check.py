@@ -9,6 +9,7 @@ each target, before and after any of its frames.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -29,6 +30,10 @@ _DOUBTFUL_CHI2 = 16.3  # limit of three coordinates; chance exceeds it once in 1
 _SAME_CHI2 = 13.8  # targets within this Δχ² of the worst one may be the wrong one instead
 # Singular values below this share count as zero: the frames do not check such a direction.
 _MIN_DETERMINED = 1e-6
+_FREE_M = 100.0  # a-priori standard deviation of a position of which nothing is known
+# Largest share of the squared residuals that is left where one wrong position explains why frames
+# leave a target out. It is larger if, in some frames, another object was taken for the target.
+_MAX_REST = 0.25
 _MIN_SD_M = 1e-4  # lower limit of a position's standard deviation: no survey is better
 _CHECKED = CALIBRATION_PARAMETERS[:5]  # fx, fy, cx, cy, k1: what frames together determine best
 _RING_SHARE = 0.01  # radius of a ring whose distance depends on the calibration, of the distance
@@ -111,11 +116,15 @@ class _Equations:
     def positions(self) -> slice:
         return slice(len(self.prior_m2))
 
-    def noise_factor(self, count: int) -> float:
-        """Return the factor of the images' variances if the first `count` unknowns are free."""
+    def squares_without(self, count: int) -> float:
+        """Return the weighted squares of the residuals if the first `count` unknowns are free."""
         normal, right = self.normal[:count, :count], self.right[:count]
         free = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
-        return max(1.0, (self.squares - float(free @ right)) / max(1, self.freedom - count))
+        return self.squares - float(free @ right)
+
+    def noise_factor(self, count: int) -> float:
+        """Return the factor of the images' variances if the first `count` unknowns are free."""
+        return max(1.0, self.squares_without(count) / max(1, self.freedom - count))
 
 
 def wrong_input(
@@ -167,6 +176,14 @@ def _contradiction(
 
     agreeing = equations(oriented)
     position: WrongPosition | MovedTarget | None = _wrong_position(agreeing)
+    # If most frames leave out a target, the one with the wrong position may be another, with which
+    # too few targets are left to contradict it.
+    disputed = _mostly_left_out(oriented)
+    if disputed:
+        all_of_them = equations([replace(pose, used=_with(disputed, pose)) for pose in oriented])
+        wrong = _wrong_position(all_of_them)
+        if wrong is not None and _explains_all(wrong, all_of_them):
+            position = wrong
     # frames that show a target at its other place may have left it out
     everything = equations([replace(pose, used=pose.targets) for pose in oriented])
     moved = moved_target(
@@ -178,8 +195,20 @@ def _contradiction(
     )
     if moved and not (position and position.chi2 > moved.chi2):
         position = moved
-    wrong, chi2 = _wrong_camera(agreeing, camera)
-    return wrong if wrong and not (position and position.chi2 > chi2) else position
+    lens, chi2 = _wrong_camera(agreeing, camera)
+    return lens if lens and not (position and position.chi2 > chi2) else position
+
+
+def _mostly_left_out(oriented: Sequence[FramePose]) -> frozenset[str]:
+    """Return the targets that most of the frames that measured them left out."""
+    measured = Counter(name for pose in oriented for name in pose.targets)
+    used = Counter(name for pose in oriented for name in pose.used)
+    return frozenset(name for name, count in measured.items() if 2 * used[name] < count)
+
+
+def _with(disputed: frozenset[str], pose: FramePose) -> tuple[str, ...]:
+    """Return the targets of a frame that it used, or that are disputed."""
+    return tuple(name for name in pose.targets if name in pose.used or name in disputed)
 
 
 def _in_time(poses: Sequence[FramePose], sightings: Sequence[Sighting]) -> Sequence[FramePose]:
@@ -192,26 +221,49 @@ def _in_time(poses: Sequence[FramePose], sightings: Sequence[Sighting]) -> Seque
 
 def _wrong_position(equations: _Equations) -> WrongPosition | None:
     """Return the position that the frames contradict most; None: none is doubtful."""
-    names, places, prior = equations.names, equations.positions, equations.prior_m2
+    names, prior = equations.names, equations.prior_m2
+    chi2, off_m = _by_position(equations, prior)
+    worst = int(np.argmax(chi2))
+    if chi2[worst] < _DOUBTFUL_CHI2:
+        return None
+    suspects = [row for row in np.argsort(-chi2) if chi2[worst] - chi2[row] < _SAME_CHI2]
+    return WrongPosition(
+        tuple(names[row] for row in suspects), float(off_m[worst]), float(chi2[worst])
+    )
+
+
+def _by_position(equations: _Equations, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return for each of n positions (n,) the decrease of χ² if it is left out, and its error [m].
+
+    Parameters
+    ----------
+    prior : (3 n, 3 n) array
+        Covariance of the positions [m²].
+    """
+    places = equations.positions
     normal, right = equations.normal[places, places], equations.right[places]
     # residuals that no corrections explain scale the noise of the images, but not the prior
     factor = equations.noise_factor(len(normal))
     gain = np.linalg.solve(np.eye(len(normal)) + prior @ (normal / factor), prior)
     corrections, correction_cov = gain @ right / factor, prior - gain
-    blocks = [slice(3 * row, 3 * row + 3) for row in range(len(names))]
-    solved = [
-        np.linalg.lstsq(correction_cov[at, at], corrections[at], rcond=_MIN_DETERMINED)[0]
-        for at in blocks
-    ]
-    chi2 = np.array([corrections[at] @ w for at, w in zip(blocks, solved, strict=True)])
-    worst = int(np.argmax(chi2))
-    if chi2[worst] < _DOUBTFUL_CHI2:
-        return None
-    suspects = [row for row in np.argsort(-chi2) if chi2[worst] - chi2[row] < _SAME_CHI2]
-    off_m = prior[blocks[worst], blocks[worst]] @ solved[worst]
-    return WrongPosition(
-        tuple(names[row] for row in suspects), float(np.linalg.norm(off_m)), float(chi2[worst])
-    )
+    chi2, off_m = [], []
+    for row in range(len(equations.names)):
+        at = slice(3 * row, 3 * row + 3)
+        solved = np.linalg.lstsq(correction_cov[at, at], corrections[at], rcond=_MIN_DETERMINED)[0]
+        chi2.append(float(corrections[at] @ solved))
+        off_m.append(float(np.linalg.norm(prior[at, at] @ solved)))
+    return np.array(chi2), np.array(off_m)
+
+
+def _explains_all(wrong: WrongPosition, equations: _Equations) -> bool:
+    """Tell whether images and other positions agree once a wrong position is free."""
+    prior = equations.prior_m2.copy()
+    first = 3 * equations.names.index(wrong.targets[0])
+    prior[range(first, first + 3), range(first, first + 3)] += _FREE_M**2
+    chi2, _ = _by_position(equations, prior)
+    others = np.delete(chi2, first // 3)
+    rest = equations.squares_without(len(prior))
+    return rest < _MAX_REST * equations.squares and bool(np.all(others < _DOUBTFUL_CHI2))
 
 
 def _wrong_camera(equations: _Equations, camera: Camera) -> tuple[WrongCamera | None, float]:

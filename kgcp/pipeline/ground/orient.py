@@ -104,6 +104,12 @@ class FlightPoses:
         return tuple(each for each in self.poses if each.pose is not None)
 
     @property
+    def suspects(self) -> tuple[str, ...]:
+        """Targets of which one has a wrong position, the likeliest first."""
+        wrong = self.wrong_input
+        return wrong.targets if isinstance(wrong, WrongPosition) else ()
+
+    @property
     def focal_px(self) -> tuple[float, float] | None:
         """Focal length and its standard deviation by all frames [px]; None: it was known."""
         pairs = [
@@ -192,7 +198,11 @@ class FlightPoses:
             return (
                 "the positions of the targets contradict each other: that of"
                 f" {first} is off by {rounded(wrong.off_m)} m"
-                + (f", or that of {' or '.join(others)} is wrong" if others else "")
+                + (
+                    f", or that of {' or '.join(others)} is wrong: the frames do not tell which"
+                    if others
+                    else ""
+                )
                 + f" (χ² {wrong.chi2:.0f} of 3), or a diameter is wrong; poses may be off by more"
                 " than is stated"
             )
