@@ -9,10 +9,9 @@ import numpy as np
 
 from kgcp.quality.checks.doubt import Doubt
 from kgcp.quality.consistency import Consistency
-from kgcp.quality.corrections import Correction
+from kgcp.quality.corrections import MAX_VARIANCE_FACTOR, Correction
 from kgcp.quality.number_text import amount
 
-_MAX_VARIANCE_FACTOR = 2.0  # after corrections that explain a disagreement
 _AXES = {"forward": 0, "right": 1, "down": 2}
 _LIKE_DOWN = (
     "wrong heights of trajectory or reference poses look the same, and so do wrong fx, fy or"
@@ -37,7 +36,7 @@ def advice(consistency: Consistency, doubts: Sequence[Doubt]) -> tuple[str, ...]
 def _why_no_correction(consistency: Consistency) -> str:
     if is_explained(consistency):
         return "no correction is offered, because a doubt names a likelier cause"
-    if consistency.estimate.variance_factor <= _MAX_VARIANCE_FACTOR:
+    if consistency.estimate.variance_factor <= MAX_VARIANCE_FACTOR:
         return "only implausibly large corrections would explain it"
     ratio = math.sqrt(consistency.estimate.variance_factor)
     return (
@@ -55,7 +54,7 @@ def is_explained(consistency: Consistency) -> bool:
     """Tell whether credible corrections, or none at all, explain the disagreement."""
     due = [each for each in consistency.estimate.corrections if each.is_significant]
     is_credible = all(correction.is_credible for correction in due)
-    return is_credible and consistency.estimate.variance_factor <= _MAX_VARIANCE_FACTOR
+    return is_credible and consistency.estimate.variance_factor <= MAX_VARIANCE_FACTOR
 
 
 def corrections(consistency: Consistency) -> tuple[tuple[str, str], ...]:
@@ -112,7 +111,7 @@ def _remedy(correction: Correction) -> str:
         keys = "fx and fy in [camera]" if quantity == "focal_length" else "diameters in [[target]]"
         return f"change {keys} by {change.replace('percent', '%')}, then run 'kgcp detect' again"
     if quantity == "readout":
-        return f"add {change} to [camera] readout_s in flight.toml"
+        return f"add {change} to [camera] readout_s in flight.toml, then run 'kgcp detect' again"
     if quantity.startswith("lever_arm_"):
         axis = quantity.removeprefix("lever_arm_")
         text = f"add {change} to [vehicle] lever_arm_m[{_AXES[axis]}] ({axis}) in flight.toml"

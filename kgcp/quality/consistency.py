@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import median
 
 import numpy as np
@@ -17,7 +17,13 @@ from kgcp.georef.scene_rotation import CameraMotions
 from kgcp.georef.sighting import Sighting, unmistakable
 from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.quality.consistency_equations import ComparedFrame, ConsistencyEquations
-from kgcp.quality.corrections import UNKNOWN_LIMITS, CorrectionEstimate, estimate_corrections
+from kgcp.quality.corrections import (
+    MAX_VARIANCE_FACTOR,
+    READOUT,
+    UNKNOWN_LIMITS,
+    CorrectionEstimate,
+    estimate_corrections,
+)
 from kgcp.quality.robust_gls import (
     ErrorModel,
     find_outliers,
@@ -28,6 +34,14 @@ from kgcp.settings import VehicleSettings
 
 MIN_FRAMES = 10
 _CORRELATION_TIMES_S = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
+# Readouts that are tried: sizes of images depend on them too unevenly for one step from the stated
+# one [s].
+_READOUTS_S = tuple((0.0075 * np.arange(-8, 9)).tolist())
+_READOUT_STEPS = 2
+_MAX_SEARCHED = 200  # frames in which they are; more would only take longer
+# Least gain in −2 log likelihood by the sizes of the images; chance gains as much in one of 1000
+# flights.
+_MIN_GAIN = 10.8
 _REGULARISATION_M2 = 1e-12  # keeps a covariance that is zero along an axis invertible
 
 
@@ -97,23 +111,16 @@ def study_consistency(
     equations = ConsistencyEquations.of(
         frames, orientations, camera, target_positions.vehicle.settings.sd_time_s, motions
     )
-    outlier = find_outliers(
-        -equations.design,
-        equations.offset,
-        equations.correlated + equations.independent,
-        limits=UNKNOWN_LIMITS,
-        min_scale=1.0,
-    )
-    if np.count_nonzero(~outlier) < MIN_FRAMES:
+    adjusted = _robustly_adjusted(frames, equations)
+    if adjusted is None:
         return None
-    fitted, correlation_s = _adjust(
-        np.array([frame.time_s for frame in frames]), equations, ~outlier
-    )
+    if _may_have_other_readout(adjusted.estimate):
+        adjusted = _with_other_readout(frames, adjusted, camera) or adjusted
     settings = target_positions.vehicle.settings
     return Consistency(
-        _discrepancies(frames, equations, outlier, fitted, settings.time_offset_s),
-        fitted,
-        correlation_s,
+        _discrepancies(frames, equations, adjusted, settings.time_offset_s),
+        adjusted.estimate,
+        adjusted.correlation_s,
         _stated_sd(settings, [frame.sighting for frame in frames]),
     )
 
@@ -126,13 +133,53 @@ def _stated_sd(settings: VehicleSettings, sightings: Sequence[Sighting]) -> Mapp
     return {"time_offset_s": settings.sd_time_s, **of_arm, **of_scale}
 
 
-def _adjust(
-    time_s: FloatArray, equations: ConsistencyEquations, kept: BoolArray
-) -> tuple[CorrectionEstimate, float]:
-    """Return the corrections from the frames that are kept, and the likeliest correlation time.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Adjusted:
+    """Equations, and the corrections that fit them."""
+
+    equations: ConsistencyEquations
+    outlier: BoolArray  # (n,): frames that were left out
+    estimate: CorrectionEstimate
+    correlation_s: float  # the likeliest
+    misfit: float  # −2 log likelihood, but for a constant
+
+    @property
+    def residual_m(self) -> FloatArray:
+        """Offsets (n, 3) after the corrections, in ENU axes [m]."""
+        return np.asarray(self.equations.offset + self.equations.design @ self.estimate.values)
+
+
+def _robustly_adjusted(
+    frames: Sequence[ComparedFrame], equations: ConsistencyEquations, readout_s: float = 0.0
+) -> _Adjusted | None:
+    """Adjust without outliers; None: too few frames are left."""
+    outlier = find_outliers(
+        -equations.design,
+        equations.offset,
+        equations.correlated + equations.independent,
+        limits=UNKNOWN_LIMITS,
+        min_scale=1.0,
+    )
+    if np.count_nonzero(~outlier) < MIN_FRAMES:
+        return None
+    return _adjusted(frames, equations, outlier, readout_s)
+
+
+def _adjusted(
+    frames: Sequence[ComparedFrame],
+    equations: ConsistencyEquations,
+    outlier: BoolArray,
+    readout_s: float = 0.0,
+) -> _Adjusted:
+    """Adjust with the likeliest correlation time of the trajectory's errors.
 
     The time is estimated, not assumed. A wrong one would weight neighbouring frames as if their
     trajectory were far better, or far worse, than it is.
+
+    Parameters
+    ----------
+    readout_s : float
+        Correction of the readout that the equations already include.
     """
     columns = np.concatenate(
         (
@@ -142,21 +189,74 @@ def _adjust(
             equations.shared,
         ),
         axis=2,
-    )[kept]
+    )[~outlier]
     correlated = equations.correlated + _REGULARISATION_M2 * np.eye(3)
-    errors = ErrorModel(equations.independent, correlated, time_s).kept(kept)
+    time_s = np.array([frame.time_s for frame in frames])
+    errors = ErrorModel(equations.independent, correlated, time_s).kept(~outlier)
     trials = []
     for correlation_s in _CORRELATION_TIMES_S:
         products, log_det = with_shared_errors(
             *whitened_products(columns, errors, correlation_s), equations.shared.shape[2]
         )
-        fitted = estimate_corrections(products, 3 * len(columns), has_sds=equations.has_sds)
+        fitted = estimate_corrections(
+            products, 3 * len(columns), has_sds=equations.has_sds, readout_s=readout_s
+        )
         misfit = fitted.chi2_after
         if not equations.has_sds:  # likelihood with the likeliest scale of all variances
             misfit = 3 * len(columns) * math.log(misfit)
         trials.append((misfit + log_det, correlation_s, fitted))
-    _, correlation_s, fitted = min(trials, key=lambda trial: trial[0])
-    return fitted, correlation_s
+    misfit, correlation_s, fitted = min(trials, key=lambda trial: trial[0])
+    return _Adjusted(equations, outlier, fitted, correlation_s, misfit)
+
+
+def _may_have_other_readout(estimate: CorrectionEstimate) -> bool:
+    """Tell whether a readout is worth a search: something is wrong, and it may be the readout."""
+    is_wrong = any(correction.is_significant for correction in estimate.corrections)
+    is_wrong = is_wrong or estimate.variance_factor > MAX_VARIANCE_FACTOR
+    return is_wrong and estimate.corrections[READOUT].value is not None
+
+
+def _with_other_readout(
+    frames: Sequence[ComparedFrame], first: _Adjusted, camera: Camera
+) -> _Adjusted | None:
+    """Return the corrections with another readout that explains also the sizes of the images.
+
+    None: it explains no more than corrections which leave the sizes as they were measured.
+    """
+    kept = np.flatnonzero(~first.outlier)
+    few = kept[:: max(1, len(kept) // _MAX_SEARCHED)]
+    others = np.ones(len(frames), dtype=np.bool_)
+    others[few] = False
+
+    def at(excess_s: Sequence[float]) -> list[_Adjusted]:
+        moved = first.equations.at_readouts(frames, camera, np.array(excess_s), few)
+        return [
+            _adjusted(frames, each, others, by_s)
+            for each, by_s in zip(moved, excess_s, strict=True)
+        ]
+
+    best = min(at([each - camera.readout_s for each in _READOUTS_S]), key=lambda each: each.misfit)
+    for _ in range(_READOUT_STEPS):
+        value = best.estimate.corrections[READOUT].value
+        if value is None or abs(value) > UNKNOWN_LIMITS[READOUT]:
+            return None
+        best = min(best, *at([value]), key=lambda each: each.misfit)
+    value = best.estimate.corrections[READOUT].value
+    gain = _adjusted(frames, first.equations, others).misfit - best.misfit
+    scale = best.estimate.variance_factor if first.equations.has_sds else 1.0
+    if value is None or gain < _MIN_GAIN * max(1.0, scale):
+        return None
+    everywhere = np.arange(len(frames))
+    (moved,) = first.equations.at_readouts(frames, camera, np.array([value]), everywhere)
+    found = _robustly_adjusted(frames, moved, value)
+    if (
+        found is None
+        or not found.estimate.corrections[READOUT].is_significant
+        or found.estimate.variance_factor > MAX_VARIANCE_FACTOR
+    ):
+        return None
+    before = first.estimate.chi2_before
+    return replace(found, estimate=replace(found.estimate, chi2_before=before))
 
 
 def _compared_frames(
@@ -192,16 +292,14 @@ def _compared_frames(
 def _discrepancies(
     frames: Sequence[ComparedFrame],
     equations: ConsistencyEquations,
-    outlier: BoolArray,
-    fitted: CorrectionEstimate,
+    adjusted: _Adjusted,
     time_offset_s: float,
 ) -> tuple[Discrepancy, ...]:
     """Return the discrepancies before and after the corrections."""
-    residual = equations.offset + equations.design @ fitted.values
     track = equations.track
     cov = track @ (equations.correlated + equations.independent) @ np.swapaxes(track, 1, 2)
     offset_m = np.einsum("nij,nj->ni", track, equations.offset)
-    residual_m = np.einsum("nij,nj->ni", track, residual)
+    residual_m = np.einsum("nij,nj->ni", track, adjusted.residual_m)
     return tuple(
         Discrepancy(
             frame.sighting.frame,
@@ -210,7 +308,7 @@ def _discrepancies(
             offset_m[index],
             cov[index],
             residual_m[index],
-            bool(outlier[index]),
+            bool(adjusted.outlier[index]),
         )
         for index, frame in enumerate(frames)
     )

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.attitude import cross_matrix, place_covariances
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
@@ -17,11 +17,16 @@ from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.scene_rotation import CameraMotions, camera_motions
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition, VehicleState
+from kgcp.measurement.image_model.plate import Circles
+from kgcp.measurement.image_model.rotation_displacement import pose_displacements
 from kgcp.measurement.plate_prior import SceneRotation
+from kgcp.quality.corrections import READOUT
 
 _MODEL_SD_M = 0.001  # of interpolation and rounding; keeps covariances regular
 _UNSTATED_SD_M = 0.01  # of data without standard deviations; the residuals then set the scale
 _STANDING_M_S = 0.2  # below this speed, the direction of the track is the vehicle's heading
+_READOUT_STEP_S = 5e-4  # for numerical derivatives
+_RING_SHARE = 0.01  # radius of a ring that stands for any other, of its distance
 _MAX_INTERVAL_S = 5.0  # between camera positions through which its velocity is interpolated
 
 
@@ -55,6 +60,9 @@ class ConsistencyEquations:
     shared: FloatArray
     has_sds: bool  # whether trajectory and reference poses have standard deviations
     track: FloatArray  # (n, 3, 3): along the track, across it to the right and up, as rows
+    enu_from_camera: FloatArray  # (n, 3, 3)
+    # (n, 3): rotation of the line of sight about the camera's axes [rad/s]
+    sight_turn_rad_s: FloatArray
 
     @classmethod
     def of(
@@ -90,12 +98,13 @@ class ConsistencyEquations:
         ]
         centre = orientations.centre_m[rows]
         offset = np.array([frame.position.position_m for frame in frames]) - centre - sight
+        across_m_s = velocity - camera_velocity
+        square = np.sum(sight**2, axis=1, keepdims=True)
+        sight_turn = np.cross(sight, across_m_s) / square - camera_turn
         columns = (
             velocity[:, :, None],
             body,
-            (since_middle * (velocity - camera_velocity - np.cross(camera_turn, sight)))[
-                :, :, None
-            ],
+            (since_middle * (across_m_s - np.cross(camera_turn, sight)))[:, :, None],
         )
         # The radius in the image gives the depth; pixel and depth give the rest. So a correction
         # of the diameter scales the whole translation, and one of the focal length the depth only.
@@ -132,7 +141,66 @@ class ConsistencyEquations:
             _shared_by_poses(orientations, rows, sight, weights),
             stated,
             _track(velocity, body),
+            attitude,
+            np.einsum("nji,nj->ni", attitude, sight_turn),
         )
+
+    def at_readouts(
+        self,
+        frames: Sequence[ComparedFrame],
+        camera: Camera,
+        excess_s: FloatArray,
+        rows: IndexArray,
+    ) -> list[Self]:
+        """Return the equations as they are if `readout_s` is longer by each of some times (k,) [s].
+
+        They are right in some rows only, which saves time.
+
+        Not only the row of the target is exposed at another time, but also the rows of its ring,
+        against each other: the image was sheared and stretched otherwise than was measured, and the
+        target is nearer or farther. The distance is no linear function of that: an ellipse that is
+        too long is nearer, one that is too short is tilted.
+        """
+        steps_s = excess_s[:, None] + _READOUT_STEP_S * np.array([0.0, -1.0, 1.0])
+        moved = np.array(
+            [
+                _poses_unsheared(
+                    frames[row], camera, steps_s.ravel()[:, None] * self.sight_turn_rad_s[row]
+                )
+                for row in rows.tolist()
+            ]
+        )
+        moved = np.einsum("nij,nkj->kni", self.enu_from_camera[rows], moved)
+        moved = moved.reshape(len(excess_s), 3, len(rows), 3)
+        others = []
+        for excess, (here, before, after) in zip(excess_s.tolist(), moved, strict=True):
+            design = self.design.copy()
+            offset = self.offset + excess * design[:, :, READOUT]
+            offset[rows] -= here
+            design[rows, :, READOUT] -= (after - before) / (2.0 * _READOUT_STEP_S)
+            others.append(replace(self, offset=offset, design=design))
+        return others
+
+
+def _poses_unsheared(frame: ComparedFrame, camera: Camera, turns: FloatArray) -> FloatArray:
+    """Return how far the target moves (k, 3) in the camera frame if its image is unsheared [m].
+
+    Parameters
+    ----------
+    turns : (k, 3) array
+        Rotations of the scene during the readout that the measurement has not taken into account
+        [rad].
+    """
+    delay = camera.mean_focal_px / (camera.height - 1)  # per unit of y, in readouts
+    circles = _small_ring(_RING_SHARE * frame.pose.distance_m)
+    return pose_displacements(frame.pose, circles, delay, turns)[:, :3]
+
+
+def _small_ring(radius_m: float) -> Circles:
+    """Return a ring with four dots; what shears do to its distance hardly depends on its size."""
+    dots = 0.7 * radius_m * np.array([[1.0, 0.0, -0.8, 0.0], [0.0, 1.0, -0.6, -1.0]])
+    radii = radius_m * np.array([1.0, 0.1, 0.1, 0.1, 0.1])
+    return Circles(np.hstack((np.zeros((2, 1)), dots)), radii, np.ones(5))
 
 
 def _correlated_m2(position: TargetPosition) -> FloatArray:

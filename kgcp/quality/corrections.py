@@ -11,6 +11,9 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.quality.robust_gls import separable_unknowns, two_sided_probability
 
+MAX_VARIANCE_FACTOR = 2.0
+"""Variance factor up to which corrections explain a disagreement."""
+
 _SIGNIFICANT = 0.001  # largest probability of a significant correction
 
 
@@ -44,6 +47,9 @@ UNKNOWNS = (
 )
 """Likeliest first: of unknowns that cannot be separated, the last is not estimated."""
 
+READOUT = [unknown.name for unknown in UNKNOWNS].index("readout_s")
+"""Column of the readout."""
+
 UNKNOWN_LIMITS: FloatArray = np.array([unknown.limit for unknown in UNKNOWNS])
 _MAX_INFLATIONS = [unknown.max_inflation for unknown in UNKNOWNS]
 
@@ -74,7 +80,9 @@ class CorrectionEstimate:
     """Corrections, and the sums of squares without and with them."""
 
     corrections: tuple[Correction, ...]  # in the order of `UNKNOWNS`
-    values: FloatArray  # (10,): in the units of the adjustment; 0 where not estimated
+    # (10,): in the units of the adjustment, without what the equations already include; 0 where
+    # not estimated
+    values: FloatArray
     # sums of squares of the residuals over their stated standard deviations, without and with the
     # corrections
     chi2_before: float
@@ -87,7 +95,9 @@ class CorrectionEstimate:
         return self.chi2_after / self.degrees_of_freedom
 
 
-def estimate_corrections(products: FloatArray, count: int, *, has_sds: bool) -> CorrectionEstimate:
+def estimate_corrections(
+    products: FloatArray, count: int, *, has_sds: bool, readout_s: float = 0.0
+) -> CorrectionEstimate:
     """Estimate the corrections from weighted products.
 
     Parameters
@@ -101,22 +111,29 @@ def estimate_corrections(products: FloatArray, count: int, *, has_sds: bool) -> 
     has_sds : bool
         Whether every error has a stated standard deviation. Then the scatter of the residuals can
         only enlarge the standard deviations of the corrections; otherwise it determines them.
+    readout_s : float
+        Correction of the readout that the equations already include.
 
     Notes
     -----
     A scale of the distances resembles the lever arm's part down. If both were always estimated,
     both could be too uncertain to be significant, and an error of either would go unnoticed.
     """
-    fitted = _estimate(products, count, UNKNOWNS, has_sds=has_sds)
+    fitted = _estimate(products, count, UNKNOWNS, readout_s, has_sds=has_sds)
     pairs = zip(UNKNOWNS, fitted.corrections, strict=True)
     if any(unknown.is_scale and found.is_significant for unknown, found in pairs):
         return fitted
     others = [unknown for unknown in UNKNOWNS if not unknown.is_scale]
-    return _estimate(products, count, others, has_sds=has_sds)
+    return _estimate(products, count, others, readout_s, has_sds=has_sds)
 
 
 def _estimate(
-    products: FloatArray, count: int, wanted: Sequence[Unknown], *, has_sds: bool
+    products: FloatArray,
+    count: int,
+    wanted: Sequence[Unknown],
+    readout_s: float,
+    *,
+    has_sds: bool,
 ) -> CorrectionEstimate:
     """Estimate those corrections that are wanted and determined."""
     normal, observed, common = products[:-2, :-2], products[:-2, -2], products[:-2, -1]
@@ -134,8 +151,10 @@ def _estimate(
     shift = inverse @ common[active]
     sds = np.full(len(UNKNOWNS), np.nan)
     sds[active] = np.sqrt(np.diag(cov) + shift**2)
+    included = np.zeros(len(UNKNOWNS))
+    included[READOUT] = readout_s
     corrections = tuple(
-        _correction(index, float(values[index]), float(sds[index]), freedom, groups)
+        _correction(index, float((included + values)[index]), float(sds[index]), freedom, groups)
         for index in range(len(UNKNOWNS))
     )
     return CorrectionEstimate(corrections, values, before, after, freedom)

@@ -8,6 +8,7 @@ a-priori standard deviations, and are eliminated.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,10 @@ from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.geometry.calibration import distort_jacobian_by_calibration
 from kgcp.geometry.camera import Camera
+from kgcp.georef.sighting import Sighting
+from kgcp.measurement.systematic_errors import pose_by_calibration
 from kgcp.network.ground.point_equations import (
     add_products,
     fill_in_covariances,
@@ -34,6 +38,7 @@ _ROUNDING = 1e-9  # expected decrease of χ² below which no step is tried
 # ends, χ² must have risen by at least this share of the rise that the covariance predicts.
 _CURVE_END_SD, _MIN_RISE = 3.0, 0.5
 _HALF_WEIGHT_CHI2 = 9.0  # χ² of a point that has weight 1/2 in the common errors
+_RING_SHARE = 0.01  # radius of a ring whose distance depends on the calibration, of the distance
 _COMMON_ROUNDS = 5  # rounds of reweighting for the common errors
 # Lower limit of a rotation rate's standard deviation. A file may state 0, which has no inverse.
 _MIN_MOTION_SD_RAD_S = 1e-6
@@ -351,6 +356,24 @@ def position_slopes(
     near = _linearised(camera, images, pose)
     slopes = _pose_slopes(images, near, _by_positions(near), sd_focal)
     return slopes.reshape(len(slopes), len(images), 3)
+
+
+def observations_by_calibration(
+    camera: Camera, sightings: Sequence[Sighting], count: int
+) -> FloatArray:
+    """Return the derivatives (n, 3, count) of computed minus measured places and logs of distances.
+
+    They are those by the first of `CALIBRATION_PARAMETERS`.
+    """
+    pixels = np.array([each.centre_px for each in sightings])
+    slopes = np.zeros((len(sightings), 3, count))
+    slopes[:, :2] = distort_jacobian_by_calibration(camera, camera.undistort(pixels))[..., :count]
+    for row, each in enumerate(sightings):
+        if each.pose is not None:
+            radius_m = _RING_SHARE * each.pose.distance_m
+            by_pose = pose_by_calibration(camera, radius_m, each.pose)[:3, :count]
+            slopes[row, 2] = -each.pose.translation_m @ by_pose / each.pose.distance_m**2
+    return slopes
 
 
 def calibration_slopes(

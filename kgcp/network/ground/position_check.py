@@ -16,14 +16,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, distort_jacobian_by_calibration
+from kgcp.geometry.calibration import CALIBRATION_PARAMETERS
 from kgcp.geometry.camera import Camera
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition
-from kgcp.measurement.systematic_errors import pose_by_calibration
 from kgcp.network.ground.frame_poses import NO_MOTIONS, SD_FOCAL, FramePose, point_images
 from kgcp.network.ground.point_images import CameraMotion, PointImages
-from kgcp.network.ground.pose_adjustment import calibration_slopes, position_equations
+from kgcp.network.ground.pose_adjustment import (
+    calibration_slopes,
+    observations_by_calibration,
+    position_equations,
+)
 from kgcp.network.ground.target_moves import FrameEquations, MovedTarget, moved_target
 
 _DOUBTFUL_CHI2 = 16.3  # limit of three coordinates; chance exceeds it once in 1000 targets
@@ -36,7 +39,6 @@ _FREE_M = 100.0  # a-priori standard deviation of a position of which nothing is
 _MAX_REST = 0.25
 _MIN_SD_M = 1e-4  # lower limit of a position's standard deviation: no survey is better
 _CHECKED = CALIBRATION_PARAMETERS[:5]  # fx, fy, cx, cy, k1: what frames together determine best
-_RING_SHARE = 0.01  # radius of a ring whose distance depends on the calibration, of the distance
 _WRONG_CAMERA_CHI2 = 20.5  # limit of five parameters; chance exceeds it once in 1000 flights
 _MAX_OFF_SDS = 3.0  # by which a wrong calibration displaces cameras that are not reported
 _NAMED_SDS = 4.0  # by which a parameter is off that is named
@@ -109,7 +111,9 @@ class _Equations:
     squares: float  # of the weighted residuals without corrections
     freedom: int
     prior_m2: FloatArray  # (3 n, 3 n): covariance of the positions
-    oriented: Sequence[tuple[FramePose, PointImages, FloatArray]]  # with `_by_calibration`
+    oriented: Sequence[
+        tuple[FramePose, PointImages, FloatArray]
+    ]  # with `observations_by_calibration`
     frames: Sequence[FrameEquations]  # whose sum this is
 
     @property
@@ -178,12 +182,10 @@ def _contradiction(
     position: WrongPosition | MovedTarget | None = _wrong_position(agreeing)
     # If most frames leave out a target, the one with the wrong position may be another, with which
     # too few targets are left to contradict it.
-    disputed = _mostly_left_out(oriented)
-    if disputed:
-        all_of_them = equations([replace(pose, used=_with(disputed, pose)) for pose in oriented])
-        wrong = _wrong_position(all_of_them)
-        if wrong is not None and _explains_all(wrong, all_of_them):
-            position = wrong
+    disputed = equations(_with_disputed(oriented))
+    wrong = _wrong_position(disputed) if disputed.oriented else None
+    if wrong is not None and _explains_all(wrong, disputed):
+        position = wrong
     # frames that show a target at its other place may have left it out
     everything = equations([replace(pose, used=pose.targets) for pose in oriented])
     moved = moved_target(
@@ -199,16 +201,14 @@ def _contradiction(
     return lens if lens and not (position and position.chi2 > chi2) else position
 
 
-def _mostly_left_out(oriented: Sequence[FramePose]) -> frozenset[str]:
-    """Return the targets that most of the frames that measured them left out."""
-    measured = Counter(name for pose in oriented for name in pose.targets)
-    used = Counter(name for pose in oriented for name in pose.used)
-    return frozenset(name for name, count in measured.items() if 2 * used[name] < count)
-
-
-def _with(disputed: frozenset[str], pose: FramePose) -> tuple[str, ...]:
-    """Return the targets of a frame that it used, or that are disputed."""
-    return tuple(name for name in pose.targets if name in pose.used or name in disputed)
+def _with_disputed(oriented: Sequence[FramePose]) -> list[FramePose]:
+    """Return the frames with targets that most of them left out; empty: there are none."""
+    left_out = Counter(name for each in oriented for name in set(each.targets) - set(each.used))
+    used = Counter(name for each in oriented for name in each.used)
+    disputed = {name for name, count in left_out.items() if count > used[name]}
+    names = [[n for n in each.targets if n in disputed or n in each.used] for each in oriented]
+    changed = [replace(each, used=tuple(n)) for each, n in zip(oriented, names, strict=True)]
+    return changed if disputed else []
 
 
 def _in_time(poses: Sequence[FramePose], sightings: Sequence[Sighting]) -> Sequence[FramePose]:
@@ -328,7 +328,7 @@ def _equations(
         sightings = [by_frame_and_target[pose.frame, name] for name in used]
         images = point_images(sightings, positions, sd_scale, camera, motions.get(pose.frame))
         has_free_focal = pose.sd_focal_scale is not None
-        by_calibration = _by_calibration(camera, sightings)
+        by_calibration = observations_by_calibration(camera, sightings, len(_CHECKED))
         equations = position_equations(
             camera, images, pose.pose, SD_FOCAL * has_free_focal, by_calibration
         )
@@ -348,17 +348,3 @@ def _equations(
         position_cov = _MIN_SD_M**2 * np.eye(3) + (0.0 if cov is None else cov)
         prior[3 * row : 3 * row + 3, 3 * row : 3 * row + 3] = position_cov
     return _Equations(names, normal, right, squares, freedom, prior, oriented, frames)
-
-
-def _by_calibration(camera: Camera, sightings: Sequence[Sighting]) -> FloatArray:
-    """Return the derivatives (n, 3, k) of computed minus measured places and logs of distances."""
-    pixels = np.array([each.centre_px for each in sightings])
-    slopes = np.zeros((len(sightings), 3, len(_CHECKED)))
-    by_all = distort_jacobian_by_calibration(camera, camera.undistort(pixels))
-    slopes[:, :2] = by_all[:, :, : len(_CHECKED)]
-    for row, each in enumerate(sightings):
-        if each.pose is not None:
-            radius_m = _RING_SHARE * each.pose.distance_m
-            by_pose = pose_by_calibration(camera, radius_m, each.pose)[:3, : len(_CHECKED)]
-            slopes[row, 2] = -each.pose.translation_m @ by_pose / each.pose.distance_m**2
-    return slopes

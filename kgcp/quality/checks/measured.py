@@ -27,6 +27,7 @@ from kgcp.quality.checks.static_targets import (
 )
 from kgcp.quality.checks.stretch import check_stretch
 from kgcp.quality.consistency import Consistency
+from kgcp.quality.corrections import READOUT
 from kgcp.targets.plain import AnyTarget
 
 # Ratio of a disagreement to what the print explains, from which on it has another cause, too.
@@ -109,7 +110,9 @@ def _of_encounters(
         yield from causes
         return
     yield from check_mount(encounters)
-    for doubt in check_stretch(encounters):
+    # another readout stretches images, and so does a print that is not round
+    is_sheared = _has_other_readout(consistency)
+    for doubt in () if is_sheared else check_stretch(encounters):
         yield doubt
         if _explains(encounters, 0.5 * doubt.figures["stretch"]):
             return
@@ -119,6 +122,13 @@ def _of_encounters(
             yield mild(Cause.CORRECTION, sentence, remedy)
     elif MISFIT < encounters.misfit < np.inf:
         yield unexplained(encounters)
+
+
+def _has_other_readout(consistency: Consistency | None) -> bool:
+    """Tell whether vehicle and camera agree only with another readout of a rolling shutter."""
+    if consistency is None or not is_explained(consistency):
+        return False
+    return consistency.estimate.corrections[READOUT].is_significant
 
 
 def _explains(encounters: Encounters, share: float) -> bool:

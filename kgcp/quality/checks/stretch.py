@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.measurement.plate_prior import SceneRotation
 from kgcp.quality.checks.doubt import Cause, Doubt, mild
 from kgcp.quality.checks.encounters import Encounters
 from kgcp.quality.number_text import amount
@@ -145,7 +146,9 @@ def check_stretch(encounters: Encounters) -> Iterator[Doubt]:
 
     Images under a rolling shutter are not in doubt: there, the motion stretches them. Nor is the
     print if stretched images explain the poses as well, as they do if the plate always has the same
-    heading in the image.
+    heading in the image. The motion may also have the same direction on the plate in all frames, as
+    that of a vehicle below a camera that hovers: so the print is in doubt only if it is stretched
+    by more than a motion as fast as `motion_sd_deg_s` stretches images.
     """
     views = _Views.of(encounters)
     if len(views.measured) < _MIN_FRAMES:
@@ -156,7 +159,10 @@ def check_stretch(encounters: Encounters) -> Iterator[Doubt]:
         return
     least = min(stretch.scatter for stretch in found.values())
     likely = {what: each for what, each in found.items() if each.scatter < _ALIKE * least}
-    if _IMAGES in likely and encounters.camera.readout_s:
+    camera = encounters.camera
+    by_motion = SceneRotation.unknown(camera).sd_rad_s * abs(camera.readout_s)
+    by_motion *= camera.mean_focal_px / (camera.height - 1)
+    if camera.readout_s and (_IMAGES in likely or likely[_PRINT].share < by_motion):
         return
     words = ", or ".join(f"{what} {each}, {_DIRECTIONS[what]}" for what, each in likely.items())
     best = min(likely.values(), key=lambda each: each.scatter)

@@ -96,6 +96,7 @@ def test_a_stretched_print_is_not_compensated_by_corrections(
 ) -> None:
     """A shorter lever arm, for example, would explain a part of the wrong distances."""
     monkeypatch.setattr(measured, "is_explained", lambda _: True)
+    monkeypatch.setattr(measured, "_has_other_readout", lambda _: False)
     monkeypatch.setattr(measured, "corrections", lambda _: [("they differ", "add 0.04 m")])
     consistency = cast("Consistency", object())
     assert [doubt.code for doubt in _of_encounters(encounters, consistency)] == [Cause.CORRECTION]
@@ -110,6 +111,7 @@ def test_wrong_diameters_are_not_compensated_by_corrections(
     encounters: Encounters, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(measured, "is_explained", lambda _: True)
+    monkeypatch.setattr(measured, "_has_other_readout", lambda _: False)
     monkeypatch.setattr(measured, "corrections", lambda _: [("they differ", "add 0.04 m")])
     consistency = cast("Consistency", object())
     assert [*_of_encounters(encounters, consistency, 1e-5)], "not the cause"
@@ -144,8 +146,12 @@ def of_a_camera_that_never_turns(encounters: Encounters) -> FloatArray:
 
 
 def test_a_rolling_shutter_may_stretch_images_but_not_the_print(encounters: Encounters) -> None:
-    rolling = replace(encounters, camera=replace(encounters.camera, readout_s=0.02))
+    camera = replace(encounters.camera, readout_s=0.02, motion_sd_deg_s=2.0)
+    rolling = replace(encounters, camera=camera)
     assert not [*check_stretch(seen_as(rolling, plate=np.eye(2), image=stretched(0.0)))]
+    # a motion of 5°/s that has the same direction on the plate in all frames stretches it as much
+    faster = replace(encounters, camera=replace(camera, motion_sd_deg_s=5.0))
+    assert not [*check_stretch(seen_as(faster, plate=stretched(0.0), image=np.eye(2)))]
     (doubt,) = check_stretch(seen_as(rolling, plate=stretched(0.0), image=np.eye(2)))
     assert "images" not in doubt.sentence
     same_heading = replace(rolling, enu_from_camera=of_a_camera_that_never_turns(rolling))
