@@ -36,6 +36,7 @@ def check_camera(
     yield from _check_focal_length(camera)
     yield from _check_principal_point(camera)
     yield from _check_corners(camera)
+    yield from _check_rows(camera)
     if is_guessed:
         yield mild(
             Cause.GUESSED_CAMERA,
@@ -56,6 +57,19 @@ def check_camera(
             "the verdict of 'kgcp calibrate' on the camera is that it is to be checked",
             "read the reasons in calibration.html, and calibrate it again; if they do not matter,"
             " delete verdict in camera.toml",
+        )
+
+
+def _check_rows(camera: Camera) -> Iterator[Doubt]:
+    """Yield the doubt about a rolling shutter whose rows seem to be the frames' columns."""
+    if camera.readout_s and camera.height > camera.width:
+        yield mild(
+            Cause.READOUT,
+            f"frames of {camera.width} x {camera.height} px are higher than wide, but sensors have"
+            " rows along their longer side, which readout_s needs: a program may have turned them",
+            "give the frames as the camera stored them (kgcp ignores the orientation in EXIF, so"
+            " that they may look turned), with their calibration; otherwise delete readout_s",
+            {"width_px": float(camera.width), "height_px": float(camera.height)},
         )
 
 

@@ -55,6 +55,7 @@ class Cause(StrEnum):
         "calibration_verdict",
         "`kgcp calibrate` found the camera unusable, or to be checked",
     )
+    READOUT = "readout", "the rows of a rolling shutter are columns of the frames, turned by 90°"
     GUESSED_CAMERA = "guessed_camera", "the camera is a guess from EXIF, not a calibration"
     DISTORTION_SIGN = "distortion_sign", "k1, k2 … have the sign of another distortion model"
     DISTORTION = (

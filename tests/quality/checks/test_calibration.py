@@ -22,6 +22,15 @@ def test_cameras_in_pixels_raise_no_doubt() -> None:
         assert not [*check_camera(camera)]
 
 
+def test_frames_turned_by_90_degrees_have_no_rows_to_read() -> None:
+    turned = replace(CAMERA, width=900, height=1200, cx=446.1, cy=606.2)
+    assert not [*check_camera(turned)]
+    assert not [*check_camera(replace(CAMERA, readout_s=0.03))]
+    (doubt,) = check_camera(replace(turned, readout_s=0.03))
+    assert doubt.code is Cause.READOUT
+    assert "as the camera stored them" in doubt.remedy
+
+
 @pytest.mark.parametrize(
     ("numbers", "code", "words"),
     [
