@@ -1,6 +1,6 @@
 """Which layouts of targets the search finds: rings of other widths, with wider or more dots.
 
-Usage: python -m benchmarks.search.layouts [--count 12] [--seed 1]
+Usage: python -m benchmarks.search.layouts [--count 12] [--seed 1] [--small-dots]
 
 Each line is for a ratio of inner to outer diameter of the ring; each column is for a number of dots
 and for their diameter divided by the width of the ring. The targets have random codes, radii of 12
@@ -35,6 +35,7 @@ from kgcp.targets.layout import Ring, Target
 
 _RATIOS = (0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75)
 _DOTS = ((4, 0.35), (4, 0.57), (4, 0.75), (6, 0.35), (6, 0.57), (6, 0.75))
+_SMALL_DOTS = tuple((dots, share) for dots in (4, 10) for share in (0.15, 0.2, 0.25, 0.3, 0.35))
 _DIAMETER_M = 0.9
 _RADIUS_PX, _TILT_DEG = (12.0, 70.0), (0.0, 35.0)
 _PSF_PX, _GAIN = 0.7, 0.85
@@ -83,14 +84,16 @@ def is_found(target: Target, seed: int, index: int, rng: np.random.Generator) ->
     "--count", type=click.IntRange(1), default=12, show_default=True, help="Frames per layout."
 )
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
-def main(count: int, seed: int) -> None:
+@click.option("--small-dots", is_flag=True, help="Layouts with smaller dots instead.")
+def main(count: int, seed: int, *, small_dots: bool) -> None:
     """Print the share of targets that is found for each layout."""
     cv2.setNumThreads(0)
+    layouts = _SMALL_DOTS if small_dots else _DOTS
     print(f"found [%] of {count} by layout; -: the dots do not fit on the ring")
-    print("ratio " + "".join(f"{dots:4d} x {share:.2f}" for dots, share in _DOTS), flush=True)
+    print("ratio " + "".join(f"{dots:4d} x {share:.2f}" for dots, share in layouts), flush=True)
     for ratio in _RATIOS:
         cells = []
-        for dots, share in _DOTS:
+        for dots, share in layouts:
             targets = []
             for index in range(count):
                 rng = stream(seed, f"{ratio} {dots} {share}", index, "plan")
