@@ -38,7 +38,7 @@ _CORRELATION_TIMES_S = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 # one [s].
 _READOUTS_S = tuple((0.0075 * np.arange(-8, 9)).tolist())
 _READOUT_STEPS = 2
-_MAX_SEARCHED = 200  # frames in which they are; more would only take longer
+_MAX_SEARCHED = 60  # frames in which they are: the search was tried on flights of 20 and 60
 # Least gain in −2 log likelihood by the sizes of the images; chance gains as much in one of 1000
 # flights.
 _MIN_GAIN = 10.8
